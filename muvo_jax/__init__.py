@@ -1,0 +1,1 @@
+"""MUVO, a multimodal generative world model for driving, in JAX."""

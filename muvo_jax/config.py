@@ -1,0 +1,344 @@
+"""The frozen description of a run: every number that is not learned. Hashable, JSON in and out, checked on creation."""
+
+from __future__ import annotations
+
+import dataclasses
+import difflib
+import types
+import typing
+from typing import Any, Literal
+
+FUSIONS = ("tr",)
+LIDAR_ENCODERS = ("rv",)
+CAMERA_ENCODERS = ("wob",)
+LATENTS = ("1d",)
+HEADS = ("image", "range_view", "occupancy", "action")
+
+
+def _check_choice(what: str, value: str, known: tuple[str, ...]) -> None:
+    if value in known:
+        return
+    near = difflib.get_close_matches(str(value), known, n=2)
+    hint = f" Did you mean {' or '.join(near)}?" if near else ""
+    raise ValueError(f"{what}: {value!r} is unknown; known are {', '.join(known)}.{hint}")
+
+
+@dataclasses.dataclass(frozen=True)
+class RangeViewGeometry:
+    """A lidar as a cylinder of pixels: row 0 looks highest, the middle column looks forward, columns grow to the right.
+
+    Attributes:
+      rows, columns: size in pixels.
+      elevation_min_rad, elevation_max_rad: vertical field of view; points outside it fall into the edge rows.
+      position_m: where the lidar sits in the ego frame.
+    """
+
+    rows: int = 64
+    columns: int = 1024
+    elevation_min_rad: float = -0.5235987755982988  # -30 degrees
+    elevation_max_rad: float = 0.17453292519943295  # +10 degrees
+    position_m: tuple[float, float, float] = (1.0, 0.0, 2.0)
+
+
+@dataclasses.dataclass(frozen=True)
+class VoxelGrid:
+    """A box of cubic voxels in the ego frame; `origin_m` is its lower corner."""
+
+    shape: tuple[int, int, int] = (192, 192, 64)
+    voxel_size_m: float = 0.5
+    origin_m: tuple[float, float, float] = (-48.0, -48.0, -6.0)
+
+
+@dataclasses.dataclass(frozen=True)
+class ActionContract:
+    """What the two numbers of an action mean, stored with every dataset and checkpoint.
+
+    action = (acceleration, steering), each in [-1, 1]: acceleration > 0 is `accel_full_mps2` of throttle at 1, < 0 is
+    `brake_full_mps2` of braking at -1; steering 1 turns the front wheels `steer_full_rad` to the right.
+
+    Attributes:
+      kinematics: "bicycle" where acceleration, steering and wheelbase describe the motion, else "none".
+      source: "recorded" where the vehicle logged its actions, "derived" where they were computed from its motion.
+    """
+
+    accel_full_mps2: float = 3.0
+    brake_full_mps2: float = 6.0
+    steer_full_rad: float = 0.6
+    wheelbase_m: float = 2.9
+    rate_hz: float = 10.0
+    kinematics: Literal["bicycle", "none"] = "bicycle"
+    source: Literal["recorded", "derived"] = "recorded"
+
+
+@dataclasses.dataclass(frozen=True)
+class ModelConfig:
+    """The network. Defaults are the paper's size and the released 1D model (RV-WOB-TR with occupancy).
+
+    Attributes:
+      fusion, lidar, camera, latent: the variant, see `variant`.
+      numerics: "standard" follows the mathematics, "reference" the authors' code (DEVIATIONS.md lists the difference).
+      heads: what is decoded; a modality that the data lacks has no head.
+      route, speed: whether the planned route and the speed are inputs.
+      image_size: rows, columns in pixels, each a multiple of 32.
+      backbone_width: channels of the first ResNet-18 level (the others are 2, 4 and 8 times as wide).
+      token_channels, transformer_*: the fusion transformer.
+      fused_channels: channels of each sensor's pooled vector after fusion.
+      embedding_channels: size of the observation embedding.
+      deterministic_channels, stochastic_channels, action_channels: the recurrent state-space model.
+      prior_dropout: probability that a training step goes on from the prior sample.
+      decoder_channels: width of the image and range-view decoders (512: 512, 512, 512, 512, 256, 128, 64).
+      occupancy_channels, occupancy_blocks: width of the voxel decoder and number of its full-width stages; its
+        constant input has shape / 2**(blocks + 3) voxels.
+      compute_dtype: of the matrix work; parameters, norms, softmax and losses stay float32.
+      convolution: "auto" takes the forms of ops/conv.py that are fast on this backend, "xla" the plain ones (needed for
+        forward-mode differentiation), "gemm" the CPU forms.
+      range_scale_m, speed_scale_mps: the model's units.
+    """
+
+    fusion: str = "tr"
+    lidar: str = "rv"
+    camera: str = "wob"
+    latent: str = "1d"
+    numerics: Literal["standard", "reference"] = "standard"
+    heads: tuple[str, ...] = HEADS
+    route: bool = True
+    speed: bool = True
+    image_size: tuple[int, int] = (320, 832)
+    range_view: RangeViewGeometry = RangeViewGeometry()
+    voxels: VoxelGrid = VoxelGrid()
+    backbone_width: int = 64
+    token_channels: int = 384
+    transformer_layers: int = 6
+    transformer_heads: int = 8
+    transformer_hidden_channels: int = 2048
+    dropout: float = 0.1
+    fused_channels: int = 512
+    measurement_channels: int = 16
+    embedding_channels: int = 512
+    deterministic_channels: int = 1024
+    stochastic_channels: int = 512
+    action_channels: int = 64
+    prior_dropout: float = 0.15
+    decoder_channels: int = 512
+    occupancy_channels: int = 64
+    occupancy_blocks: int = 3
+    compute_dtype: Literal["float32", "bfloat16"] = "float32"
+    convolution: Literal["auto", "xla", "gemm"] = "auto"
+    range_scale_m: float = 50.0
+    speed_scale_mps: float = 5.0
+
+    @property
+    def variant(self) -> str:
+        """The paper's name of the combination, such as RV-WOB-TR."""
+        return f"{self.lidar}-{self.camera}-{self.fusion}".upper()
+
+    def __post_init__(self):
+        for name, known in (("fusion", FUSIONS), ("lidar", LIDAR_ENCODERS), ("camera", CAMERA_ENCODERS),
+                            ("latent", LATENTS)):
+            _check_choice(f"model.{name}", getattr(self, name), known)
+        for head in self.heads:
+            _check_choice("model.heads", head, HEADS)
+        if any(side % 32 for side in self.image_size):
+            raise ValueError(f"model.image_size {self.image_size}: rows and columns must be multiples of 32.")
+        if self.range_view.rows % 32 or self.range_view.columns % 32:
+            raise ValueError(f"model.range_view is {self.range_view.rows}x{self.range_view.columns}: rows and columns "
+                             f"must be multiples of 32.")
+        if self.token_channels % self.transformer_heads or self.token_channels % 4:
+            raise ValueError(f"model.token_channels {self.token_channels} must be a multiple of 4 and of "
+                             f"model.transformer_heads {self.transformer_heads}.")
+        shrink = 2 ** (self.occupancy_blocks + 3)
+        if "occupancy" in self.heads and any(side % shrink for side in self.voxels.shape):
+            raise ValueError(f"model.voxels.shape {self.voxels.shape}: each side must be a multiple of {shrink} "
+                             f"(2**(occupancy_blocks + 3)).")
+
+
+@dataclasses.dataclass(frozen=True)
+class LossConfig:
+    """Weights of the loss terms (paper Eq. 1) at scale 1; scale f counts 1/f.
+
+    `image`, `range_xyz`, `range_depth` and `occupancy_*` apply per scale; 0 switches a term off.
+    """
+
+    image: float = 0.1
+    range_xyz: float = 0.1
+    range_depth: float = 0.1
+    occupancy_cross_entropy: float = 0.1
+    occupancy_semantic_scal: float = 0.1
+    occupancy_geometric_scal: float = 0.1
+    chamfer: float = 0.0
+    action: float = 1.0
+    kl: float = 1e-3
+    kl_balance: float = 0.75
+    chamfer_points: int = 1024
+    occupancy_unknown: Literal["ignore", "empty"] = "ignore"
+
+
+@dataclasses.dataclass(frozen=True)
+class OptimizerConfig:
+    """AdamW under torch's OneCycle schedule, as the reference trains.
+
+    Attributes:
+      weight_decay: applied to parameters with more than one axis.
+      warmup_fraction: share of the steps until the peak.
+      start_divisor, end_divisor: the rate starts at peak / start_divisor and ends at peak / start_divisor / end_divisor.
+      clip_norm: global gradient norm, 0 for no clipping (the reference clips nothing).
+      accumulate: micro-batches per update.
+    """
+
+    learning_rate: float = 1e-4
+    weight_decay: float = 0.01
+    beta1_low: float = 0.85
+    beta1_high: float = 0.95
+    beta2: float = 0.999
+    epsilon: float = 1e-8
+    warmup_fraction: float = 0.2
+    start_divisor: float = 25.0
+    end_divisor: float = 1e4
+    clip_norm: float = 0.0
+    accumulate: int = 1
+
+
+@dataclasses.dataclass(frozen=True)
+class DataConfig:
+    """Where the windows come from.
+
+    Attributes:
+      path: "town" (the built-in world) or a folder of recordings.
+      frames, stride: a training window is `frames` frames, each `stride` recorded frames apart.
+      context, horizon: evaluation observes `context` frames and imagines `horizon` more.
+      town_seed, town_size: which town, and how much of it ("default", "tiny").
+      cache_gib: decoded frames are kept in memory up to this size.
+    """
+
+    path: str = "town"
+    frames: int = 12
+    stride: int = 2
+    context: int = 6
+    horizon: int = 6
+    town_seed: int = 0
+    town_size: str = "default"
+    cache_gib: float = 1.5
+
+    def __post_init__(self):
+        for name in ("frames", "stride", "context", "horizon"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"data.{name} is {getattr(self, name)}; it must be at least 1.")
+
+
+@dataclasses.dataclass(frozen=True)
+class TrainConfig:
+    """How long, how wide and how often.
+
+    Attributes:
+      batch: windows per micro-batch over all devices; an update uses batch * optimizer.accumulate windows.
+      validate_every, checkpoint_every, preview_every: in steps; 0 means at the end only.
+      validation_windows: windows of each split looked at during training (evaluate uses all of them).
+      keep_last, keep_best: how many checkpoints stay.
+      parallel: "auto" uses shard_map over all devices where there is more than one.
+    """
+
+    steps: int = 50_000
+    batch: int = 1
+    seed: int = 0
+    log_every: int = 10
+    validate_every: int = 1000
+    checkpoint_every: int = 1000
+    preview_every: int = 1000
+    validation_windows: int = 16
+    keep_last: int = 2
+    keep_best: int = 1
+    parallel: Literal["auto", "pmap", "shard_map"] = "auto"
+    remat: bool = False
+
+
+@dataclasses.dataclass(frozen=True)
+class EvaluationConfig:
+    """The protocol of docs/design.md: metrics of observed and imagined frames beside two baselines.
+
+    Attributes:
+      windows: at most this many windows of a split, evenly spread; 0 means all.
+      chamfer_points: size of the keyed subset of returns per frame; 0 means all.
+      return_threshold_m: a predicted return is a predicted range above this.
+      sampled: imagine with sampled latents; otherwise with their means.
+    """
+
+    windows: int = 64
+    batch: int = 4
+    chamfer_points: int = 2048
+    return_threshold_m: float = 1.0
+    sampled: bool = False
+    seed: int = 0
+
+
+@dataclasses.dataclass(frozen=True)
+class Config:
+    """All of a run. `to_dict` and `from_dict` are exact inverses."""
+
+    preset: str = "paper-occupancy"
+    model: ModelConfig = ModelConfig()
+    loss: LossConfig = LossConfig()
+    optimizer: OptimizerConfig = OptimizerConfig()
+    data: DataConfig = DataConfig()
+    train: TrainConfig = TrainConfig()
+    evaluation: EvaluationConfig = EvaluationConfig()
+    contract: ActionContract = ActionContract()
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain JSON types."""
+        return dataclasses.asdict(self)
+
+    @classmethod
+    def from_dict(cls, values: dict[str, Any]) -> Config:
+        """Rebuilds a config from `to_dict` or parsed JSON.
+
+        Raises:
+          ValueError: for an unknown field (naming the nearest known one) or a value of the wrong type.
+        """
+        return _from_dict(cls, values, "config")
+
+
+def override(config, dotted: str, value: Any):
+    """Returns `config` with one dotted field replaced: `override(config, "model.dropout", 0.0)`.
+
+    Raises:
+      ValueError: for an unknown field, naming the nearest known one, or a value of the wrong type.
+    """
+    values = dataclasses.asdict(config)
+    node = values
+    *parents, leaf = dotted.split(".")
+    for name in parents:
+        _check_choice(f"field of {dotted!r}", name, tuple(node))
+        node = node[name]
+    _check_choice(f"field of {dotted!r}", leaf, tuple(node))
+    node[leaf] = value
+    return _from_dict(type(config), values, "config")
+
+
+def _from_dict(cls, values, path: str):
+    if not isinstance(values, dict):
+        raise ValueError(f"{path}: got {values!r}, expected the fields of {cls.__name__}.")
+    hints = typing.get_type_hints(cls)
+    for name in values:
+        _check_choice(f"{path} ({cls.__name__})", name, tuple(hints))
+    return cls(**{name: _coerce(hints[name], value, f"{path}.{name}") for name, value in values.items()})
+
+
+def _coerce(hint, value, path: str):
+    """Returns `value` as `hint` wants it (JSON lists become tuples, whole floats stay floats), or raises."""
+    if dataclasses.is_dataclass(hint):
+        return _from_dict(hint, value, path)
+    origin, arguments = typing.get_origin(hint), typing.get_args(hint)
+    if origin is Literal:
+        _check_choice(path, value, arguments)
+        return value
+    if origin is tuple and isinstance(value, (list, tuple)):
+        inner = arguments[:1] * len(value) if arguments[-1] is Ellipsis else arguments
+        if len(inner) == len(value):
+            return tuple(_coerce(kind, item, path) for kind, item in zip(inner, value, strict=True))
+    if origin is types.UnionType and value is None and type(None) in arguments:
+        return None
+    if hint is float and isinstance(value, int) and not isinstance(value, bool):
+        return float(value)
+    if isinstance(hint, type) and isinstance(value, hint) and (hint is bool or not isinstance(value, bool)):
+        return value
+    raise ValueError(f"{path}: got {value!r}, expected {getattr(hint, '__name__', hint)}.")

@@ -1,0 +1,102 @@
+"""Named configurations. A flag of the command line beats a preset, a preset beats the defaults of config.py."""
+
+from __future__ import annotations
+
+import difflib
+import math
+
+from muvo_jax import config as config_lib
+
+
+def town() -> config_lib.Config:
+    """The default: a world model small enough to learn the built-in town on two CPU cores in minutes."""
+    model = config_lib.ModelConfig(
+        image_size=(64, 256),
+        range_view=config_lib.RangeViewGeometry(rows=64, columns=256),
+        voxels=config_lib.VoxelGrid(shape=(48, 48, 16), voxel_size_m=1.0, origin_m=(-24.0, -24.0, -1.5)),
+        backbone_width=16,
+        token_channels=96,
+        transformer_layers=2,
+        transformer_heads=4,
+        transformer_hidden_channels=256,
+        fused_channels=128,
+        embedding_channels=256,
+        deterministic_channels=384,
+        stochastic_channels=128,
+        decoder_channels=128,
+        occupancy_channels=32,
+        occupancy_blocks=1,
+    )
+    return config_lib.Config(
+        preset="town",
+        model=model,
+        optimizer=config_lib.OptimizerConfig(learning_rate=1e-3, clip_norm=10.0),
+        data=config_lib.DataConfig(),
+        train=config_lib.TrainConfig(steps=400, batch=2, validate_every=200, checkpoint_every=200, preview_every=200,
+                                     validation_windows=8),
+    )
+
+
+def tiny() -> config_lib.Config:
+    """For tests and for a first look at the code: everything runs, nothing is learned."""
+    model = config_lib.ModelConfig(
+        image_size=(32, 64),
+        range_view=config_lib.RangeViewGeometry(rows=32, columns=64),
+        voxels=config_lib.VoxelGrid(shape=(16, 16, 16), voxel_size_m=2.0, origin_m=(-16.0, -16.0, -3.0)),
+        backbone_width=4,
+        token_channels=8,
+        transformer_layers=1,
+        transformer_heads=2,
+        transformer_hidden_channels=16,
+        fused_channels=8,
+        embedding_channels=16,
+        deterministic_channels=16,
+        stochastic_channels=8,
+        action_channels=8,
+        decoder_channels=8,
+        occupancy_channels=8,
+        occupancy_blocks=1,
+    )
+    return config_lib.Config(
+        preset="tiny",
+        model=model,
+        optimizer=config_lib.OptimizerConfig(learning_rate=1e-3),
+        data=config_lib.DataConfig(frames=4, context=2, horizon=2, town_size="tiny", cache_gib=0.1),
+        train=config_lib.TrainConfig(steps=4, batch=2, log_every=1, validate_every=2, checkpoint_every=2,
+                                     preview_every=4, validation_windows=2),
+        evaluation=config_lib.EvaluationConfig(windows=4, batch=2, chamfer_points=256),
+    )
+
+
+def paper() -> config_lib.Config:
+    """The paper's camera and lidar model (section IV): 12 frames, 6 observed and 6 imagined, batch 16 by accumulation."""
+    return config_lib.Config(
+        preset="paper",
+        model=config_lib.ModelConfig(heads=("image", "range_view", "action")),
+        optimizer=config_lib.OptimizerConfig(accumulate=16),
+    )
+
+
+def paper_occupancy() -> config_lib.Config:
+    """The paper's model with occupancy: 6 frames, 4 observed and 2 imagined."""
+    return config_lib.Config(
+        preset="paper-occupancy",
+        optimizer=config_lib.OptimizerConfig(accumulate=16),
+        data=config_lib.DataConfig(frames=6, context=4, horizon=2),
+    )
+
+
+PRESETS = {"town": town, "tiny": tiny, "paper": paper, "paper-occupancy": paper_occupancy}
+
+
+def get(name: str) -> config_lib.Config:
+    """Returns the preset of that name.
+
+    Raises:
+      ValueError: naming the known presets and the nearest one.
+    """
+    if name not in PRESETS:
+        near = difflib.get_close_matches(name, PRESETS, n=1, cutoff=math.sqrt(0.1))
+        hint = f" Did you mean {near[0]}?" if near else ""
+        raise ValueError(f"preset {name!r} is unknown; known are {', '.join(PRESETS)}.{hint}")
+    return PRESETS[name]()

@@ -1,0 +1,192 @@
+"""The pytrees that every part of muvo_jax exchanges.
+
+Axes: B batch, T time, N branches or points, H W image rows and columns, C channels (always last), X Y Z voxels,
+S stochastic channels, D deterministic channels.
+
+Ego frame: x forward, y left, z up, metres, origin on the ground under the ego vehicle.
+Time: `action[t]` is applied from t to t+1.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import flax.struct
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+Array = jax.Array
+ArrayLike = jax.Array | np.ndarray
+Variables = Mapping[str, Any]  # {"params": ..., "batch_stats": ...}, plain nested dictionaries
+Predictions = dict[str, dict[int, Array]]  # head name -> scale (1, 2, 4; 1 is full size) -> array
+
+OCCUPANCY_EMPTY = 0
+OCCUPANCY_OCCUPIED = 1
+OCCUPANCY_UNKNOWN = 255
+RANGE_NO_RETURN_M = -1.0
+
+
+class _Indexable:
+    """Adds `state[:, ::4]`: the same index on every leaf."""
+
+    def __getitem__(self, index):
+        return jax.tree.map(lambda leaf: leaf[index], self)
+
+
+@flax.struct.dataclass
+class Batch(_Indexable):
+    """Windows of consecutive observations, as the sensors gave them (the model normalises).
+
+    A modality that the recording lacks is None, never a zero array.
+
+    Attributes:
+      action: float32 [B, T, 2], (acceleration, steering), each in [-1, 1]; steering > 0 is right.
+      is_first: bool [B, T], true at the first step of a window and wherever a recording restarts.
+      image: uint8 [B, T, H, W, 3], RGB.
+      range_view: float32 [B, T, Hr, Wr, 4], x, y, z (ego frame, m) and range from the lidar (m);
+        0, 0, 0 and -1 where nothing returned.
+      occupancy: uint8 [B, T, X, Y, Z], 0 empty, 1 occupied, 255 unknown.
+      route_map: uint8 [B, T, 64, 64], planned route from above, 255 on route; row 0 is farthest ahead.
+      speed_mps: float32 [B, T].
+      reward: float32 [B, T].
+      is_terminal: bool [B, T].
+      intrinsics: float32 [B, 3, 3], of the image as it is here, after resizing and cropping.
+      camera_to_ego: float32 [B, 4, 4], camera frame (x right, y down, z forward) to ego frame.
+    """
+
+    action: ArrayLike
+    is_first: ArrayLike
+    image: ArrayLike | None = None
+    range_view: ArrayLike | None = None
+    occupancy: ArrayLike | None = None
+    route_map: ArrayLike | None = None
+    speed_mps: ArrayLike | None = None
+    reward: ArrayLike | None = None
+    is_terminal: ArrayLike | None = None
+    intrinsics: ArrayLike | None = None
+    camera_to_ego: ArrayLike | None = None
+
+    @property
+    def batch_size(self) -> int:
+        return self.action.shape[0]
+
+    @property
+    def frames(self) -> int:
+        return self.action.shape[1]
+
+    def time_slice(self, start: int, stop: int) -> Batch:
+        """The same windows, restricted to frames start..stop-1; calibration has no time axis and stays."""
+        untimed = ("intrinsics", "camera_to_ego")
+        timed = {name: value[:, start:stop] for name, value in vars(self).items()
+                 if value is not None and name not in untimed}
+        return self.replace(**timed)
+
+    def validate(self) -> Batch:
+        """Checks dtypes, ranks and common prefixes (static under jit).
+
+        Raises:
+          ValueError: naming the field, what came and what was expected.
+        """
+        for name, (dtype, rank) in _BATCH_FIELDS.items():
+            value = getattr(self, name)
+            if value is None:
+                continue
+            if value.dtype != dtype or value.ndim != rank:
+                raise ValueError(f"Batch.{name}: got {value.dtype}{list(value.shape)}, expected {np.dtype(dtype).name} "
+                                 f"with {rank} axes (see muvo_jax.types.Batch).")
+            prefix = 1 if name in ("intrinsics", "camera_to_ego") else 2
+            if value.shape[:prefix] != self.action.shape[:prefix]:
+                raise ValueError(f"Batch.{name}: leading axes {value.shape[:prefix]} differ from those of action, "
+                                 f"{self.action.shape[:prefix]}.")
+        return self
+
+
+_BATCH_FIELDS = {
+    "action": (np.float32, 3), "is_first": (np.bool_, 2), "image": (np.uint8, 5), "range_view": (np.float32, 5),
+    "occupancy": (np.uint8, 5), "route_map": (np.uint8, 4), "speed_mps": (np.float32, 2), "reward": (np.float32, 2),
+    "is_terminal": (np.bool_, 2), "intrinsics": (np.float32, 3), "camera_to_ego": (np.float32, 3),
+}
+
+
+@flax.struct.dataclass
+class Gaussian(_Indexable):
+    """A diagonal Gaussian: mean and std, float32 [..., S]."""
+
+    mean: Array
+    std: Array
+
+    def sample(self, noise: Array) -> Array:
+        """mean + std * noise; zeros give the mean."""
+        return self.mean + self.std * noise
+
+
+@flax.struct.dataclass
+class LatentState(_Indexable):
+    """What the world model knows: the carry of the recurrence, for training, imagination, planning and live use.
+
+    Attributes:
+      deterministic: float32 [..., D], the recurrent state h.
+      stochastic: float32 [..., S], the sampled state s.
+    """
+
+    deterministic: Array
+    stochastic: Array
+
+    @property
+    def features(self) -> Array:
+        """float32 [..., D + S], what decoders, policies and rewards read: h first, as in the reference."""
+        return jnp.concatenate([self.deterministic, self.stochastic], axis=-1)
+
+
+@flax.struct.dataclass
+class StepNoise(_Indexable):
+    """Everything random in one observed step, drawn outside so that the step itself is deterministic.
+
+    Attributes:
+      prior, posterior: standard normal, float32 [..., S]; zeros give the mean mode.
+      use_prior: bool [...], true where the next step starts from the prior sample (the paper's RSSM dropout).
+    """
+
+    prior: Array
+    posterior: Array
+    use_prior: Array
+
+
+@flax.struct.dataclass
+class Observed(_Indexable):
+    """What `observe` returns, time on axis 1.
+
+    Attributes:
+      states: LatentState [B, T, ...], each with the sample that the step carried on.
+      posterior, prior: Gaussian [B, T, S].
+    """
+
+    states: LatentState
+    posterior: Gaussian
+    prior: Gaussian
+
+    @property
+    def last(self) -> LatentState:
+        """The state after the last observed frame, where imagination starts."""
+        return self.states[:, -1]
+
+
+@flax.struct.dataclass
+class Dream(_Indexable):
+    """What `imagine` returns: H imagined steps, time on the axis after the batch (and branch) axes.
+
+    Attributes:
+      states: LatentState [B, H, ...] ([B, N, H, ...] with branches); step k is the state after action k.
+      actions: float32 [B, H, 2], the actions that were applied.
+      prior: Gaussian of each step.
+    """
+
+    states: LatentState
+    actions: Array
+    prior: Gaussian
+
+    @property
+    def features(self) -> Array:
+        return self.states.features

@@ -1,0 +1,18 @@
+"""Every test sees 8 virtual CPU devices and raises on implicit rank promotion."""
+
+import os
+
+os.environ.setdefault("JAX_PLATFORMS", "cpu")
+os.environ["XLA_FLAGS"] = os.environ.get("XLA_FLAGS", "") + " --xla_force_host_platform_device_count=8"
+
+import jax
+import pytest
+
+jax.config.update("jax_numpy_rank_promotion", "raise")
+
+
+@pytest.fixture
+def strict_dtypes():
+    """Implicit dtype promotion raises inside tests of float32 code (ops, model, objectives)."""
+    with jax.numpy_dtype_promotion("strict"):
+        yield

@@ -92,6 +92,7 @@ class ModelConfig:
       compute_dtype: of the matrix work; parameters, norms, softmax and losses stay float32.
       convolution: "auto" takes the forms of ops/conv.py that are fast on this backend, "xla" the plain ones (needed for
         forward-mode differentiation), "gemm" the CPU forms.
+      remat: recompute the decoders' stages in the backward pass instead of keeping their activations.
       range_scale_m, speed_scale_mps: the model's units.
     """
 
@@ -124,6 +125,7 @@ class ModelConfig:
     occupancy_blocks: int = 3
     compute_dtype: Literal["float32", "bfloat16"] = "float32"
     convolution: Literal["auto", "xla", "gemm"] = "auto"
+    remat: bool = False
     range_scale_m: float = 50.0
     speed_scale_mps: float = 5.0
 
@@ -156,7 +158,8 @@ class ModelConfig:
 class LossConfig:
     """Weights of the loss terms (paper Eq. 1) at scale 1; scale f counts 1/f.
 
-    `image`, `range_xyz`, `range_depth` and `occupancy_*` apply per scale; 0 switches a term off.
+    `image`, `range_xyz`, `range_depth` and `occupancy_*` apply per scale; 0 switches a term off. The Chamfer term looks at
+    `chamfer_points` returns of each side; a predicted return is a predicted range above `return_threshold_m`.
     """
 
     image: float = 0.1
@@ -170,6 +173,7 @@ class LossConfig:
     kl: float = 1e-3
     kl_balance: float = 0.75
     chamfer_points: int = 1024
+    return_threshold_m: float = 1.0
     occupancy_unknown: Literal["ignore", "empty"] = "ignore"
 
 
@@ -295,6 +299,15 @@ class Config:
           ValueError: for an unknown field (naming the nearest known one) or a value of the wrong type.
         """
         return _from_dict(cls, values, "config")
+
+
+def parse(cls, values: dict[str, Any], path: str):
+    """Builds the config dataclass `cls` from parsed JSON or TOML; `path` names the source in messages.
+
+    Raises:
+      ValueError: for an unknown field (naming the nearest known one) or a value of the wrong type.
+    """
+    return _from_dict(cls, values, path)
 
 
 def override(config, dotted: str, value: Any):

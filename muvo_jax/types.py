@@ -159,7 +159,8 @@ class Observed(_Indexable):
     """What `observe` returns, time on axis 1.
 
     Attributes:
-      states: LatentState [B, T, ...], each with the sample that the step carried on.
+      states: LatentState [B, T, ...], each with its posterior's sample, which is what decoders read (under the RSSM
+        dropout of training, the recurrence itself may have gone on from the prior's).
       posterior, prior: Gaussian [B, T, S].
     """
 

@@ -1,0 +1,234 @@
+"""Batches of windows for training (endless, shuffled, resumable) and evaluation, and their way to the devices."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import queue
+import threading
+import time
+from collections.abc import Iterator, Sequence
+from typing import Any, Generic, TypeVar
+
+import grain
+import jax
+import numpy as np
+
+from muvo_jax import config as config_lib
+from muvo_jax import types
+from muvo_jax.data import prepare, schema
+from muvo_jax.data import windows as windows_lib
+
+State = dict[str, Any]  # plain JSON types
+_READ_THREADS = 2
+_READ_AHEAD = 4  # batches
+_UNTIMED = ("intrinsics", "camera_to_ego")
+_HOST_ONLY = ("timestamp_s", "frame_id")
+_Item = TypeVar("_Item")
+
+
+class Frames:
+    """The prepared frames of a recording, made on demand and kept within `config.data.cache_gib`.
+
+    Training and evaluation of one run share one, so that memory is bounded once.
+    """
+
+    def __init__(self, recording: schema.Recording, config: config_lib.Config):
+        """`config` must be adapted to the recording (prepare.adapt)."""
+        self.recording = recording
+        self.config = config
+        self.cache = windows_lib.FrameCache(int(config.data.cache_gib * 2**30))
+
+    def get(self, sequence: schema.Sequence, index: int) -> prepare.PreparedFrame:
+        """Frame `index` of `sequence`; called from several threads at once."""
+        return self.cache.get((sequence.name, sequence.start + index), functools.partial(self._make, sequence, index))
+
+    def batch(self, windows: Sequence[windows_lib.Window]) -> types.Batch:
+        """The windows, all of one length, as one Batch of NumPy arrays.
+
+        Raises:
+          DataError: for a damaged file, naming it.
+        """
+        rows = [[self.get(window.sequence, index) for index in window.indices] for window in windows]
+        fields: dict[str, np.ndarray] = {}
+        for name, example in rows[0][0].items():
+            if name in _HOST_ONLY:
+                continue
+            if name in _UNTIMED:
+                fields[name] = np.stack([row[0][name] for row in rows])
+                continue
+            values = np.empty((len(rows), len(rows[0]), *np.shape(example)), np.asarray(example).dtype)
+            for index, row in enumerate(rows):
+                for step, frame in enumerate(row):
+                    values[index, step] = frame[name]
+            fields[name] = values
+        is_first = np.zeros(fields["action"].shape[:2], bool)
+        is_first[:, 0] = True
+        return types.Batch(is_first=is_first, **fields).validate()
+
+    def _make(self, sequence: schema.Sequence, index: int) -> prepare.PreparedFrame:
+        return prepare.prepare_frame(self.recording.read(sequence, index), self.config)
+
+
+class TrainBatches:
+    """Endless training batches: every window once an epoch, each epoch in another order, the same for the same seed.
+
+    `get_state` after n batches and a new TrainBatches with that `start_state` give exactly the batches from n + 1 on.
+    """
+
+    def __init__(self, frames: Frames, *, seed: int, batch: int | None = None, start_state: State | None = None):
+        """Opens the stream.
+
+        Args:
+          batch: windows per batch, by default config.train.batch.
+          start_state: from `get_state` of a stream with the same recording, seed and sizes.
+
+        Raises:
+          DataError: where no training window fits, or the state belongs to another stream.
+        """
+        data = frames.config.data
+        windows = windows_lib.find_windows(frames.recording, "train", frames=data.frames, stride=data.stride)
+        size = batch or frames.config.train.batch
+        self.windows_per_epoch = len(windows)
+        self._identity = {"seed": seed, "windows": len(windows), "batch": size, "frames": data.frames,
+                          "stride": data.stride}
+        dataset = grain.MapDataset.source(windows).seed(seed).shuffle().repeat().batch(size, batch_fn=frames.batch)
+        options = grain.ReadOptions(num_threads=_READ_THREADS, prefetch_buffer_size=_READ_AHEAD)
+        self._iterator = iter(dataset.to_iter_dataset(options))
+        if start_state is not None:
+            if start_state.get("identity") != self._identity:
+                raise schema.DataError(f"the saved position in the data is of {start_state.get('identity')}, this run "
+                                       f"has {self._identity}. Resume with the same data and settings, or start anew.")
+            self._iterator.set_state(start_state["position"])
+
+    def __iter__(self) -> TrainBatches:
+        return self
+
+    def __next__(self) -> types.Batch:
+        return next(self._iterator)
+
+    def get_state(self) -> State:
+        """Where the stream stands; plain JSON types."""
+        return {"identity": dict(self._identity), "position": self._iterator.get_state()}
+
+
+def train_batches(frames: Frames, *, seed: int, batch: int | None = None,
+                  start_state: State | None = None) -> TrainBatches:
+    """See TrainBatches."""
+    return TrainBatches(frames, seed=seed, batch=batch, start_state=start_state)
+
+
+@dataclasses.dataclass(frozen=True)
+class EvaluationBatch:
+    """A batch of always the same size, so that nothing is compiled twice.
+
+    Attributes:
+      batch: the windows; the last ones may be repetitions that fill the batch.
+      count: how many of its windows are real; leave the others out of every sum.
+      windows: the real windows.
+    """
+
+    batch: types.Batch
+    count: int
+    windows: tuple[windows_lib.Window, ...]
+
+
+def evaluation_batches(frames: Frames, split: str, *, windows: int, length: int | None = None,
+                       batch: int | None = None) -> Iterator[EvaluationBatch]:
+    """Yields at most `windows` windows of a split (0: all), evenly spread over it, in recorded order.
+
+    Args:
+      length: frames of a window, by default context + horizon.
+      batch: windows per batch, by default config.evaluation.batch.
+
+    Raises:
+      DataError: for an unknown split or one without a window that long; at the call, not at the first batch.
+    """
+    data = frames.config.data
+    length = length or data.context + data.horizon
+    size = batch or frames.config.evaluation.batch
+    chosen = windows_lib.spread(windows_lib.find_windows(frames.recording, split, frames=length, stride=data.stride),
+                                windows)
+    return _padded_batches(frames, chosen, size)
+
+
+def _padded_batches(frames: Frames, chosen: tuple[windows_lib.Window, ...], size: int) -> Iterator[EvaluationBatch]:
+    for start in range(0, len(chosen), size):
+        real = chosen[start:start + size]
+        filled = real + (real[-1],) * (size - len(real))
+        yield EvaluationBatch(frames.batch(filled), len(real), real)
+
+
+class Prefetch(Generic[_Item]):
+    """Moves the batches of an iterator to the devices in a background thread, a few ahead.
+
+    Close it (or use it in a `with`) when done; an error of the iterator is raised by the `next` that would have
+    returned the failed batch.
+
+    Attributes:
+      waited_s: how long the consumer has waited for data so far.
+    """
+
+    def __init__(self, iterator: Iterator[_Item], sharding: Any = None, size: int = 2):
+        """`sharding` is a jax.sharding.Sharding or device for all leaves; None is the default device."""
+        self.waited_s = 0.0
+        self._iterator = iterator
+        self._sharding = sharding
+        self._queue: queue.Queue = queue.Queue(maxsize=size)
+        self._state = _state(iterator)
+        self._stop = threading.Event()
+        self._over = False
+        self._thread = threading.Thread(target=self._work, name="prefetch_to_device", daemon=True)
+        self._thread.start()
+
+    def __iter__(self) -> Prefetch[_Item]:
+        return self
+
+    def __next__(self) -> _Item:
+        if self._over:
+            raise StopIteration
+        start_s = time.perf_counter()
+        item, state, error = self._queue.get()
+        self.waited_s += time.perf_counter() - start_s
+        if error is not None:
+            self.close()
+            raise error
+        self._state = state
+        return item
+
+    def get_state(self) -> State | None:
+        """The iterator's state after the last batch handed out (not the last read ahead); None where it has none."""
+        return self._state
+
+    def close(self) -> None:
+        """Stops the thread; further `next` calls raise StopIteration."""
+        self._over = True
+        self._stop.set()
+        while self._thread.is_alive():
+            try:  # make room, lest the thread wait for ever
+                self._queue.get_nowait()
+            except queue.Empty:
+                self._thread.join(timeout=0.01)
+
+    def __enter__(self) -> Prefetch[_Item]:
+        return self
+
+    def __exit__(self, *_) -> None:
+        self.close()
+
+    def _work(self) -> None:
+        try:
+            while not self._stop.is_set():
+                item = jax.device_put(next(self._iterator), self._sharding)
+                self._queue.put((item, _state(self._iterator), None))
+        except BaseException as error:  # StopIteration too: it ends the consumer's loop
+            self._queue.put((None, None, error))
+
+
+def _state(iterator: Any) -> State | None:
+    return iterator.get_state() if hasattr(iterator, "get_state") else None
+
+
+def prefetch_to_device(iterator: Iterator[_Item], sharding: Any = None, size: int = 2) -> Prefetch[_Item]:
+    """See Prefetch."""
+    return Prefetch(iterator, sharding, size)

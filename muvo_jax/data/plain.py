@@ -1,0 +1,216 @@
+"""The plain recording format: PNG, NPZ, CSV and TOML in folders that any tool can read (no pickle).
+
+    ROOT/recording.toml                         what holds for all of it: sensors, voxel grid, action contract
+    ROOT/<split>/<run>/frames.csv               one line a frame, written last: a run without it is incomplete
+    ROOT/<split>/<run>/image/000012.png         RGB, 8 bit
+    ROOT/<split>/<run>/lidar/000012.npz         points_m float32 [N, 3], ego frame
+    ROOT/<split>/<run>/occupancy/000012.npz     occupancy uint8 [X, Y, Z]
+    ROOT/<split>/<run>/route_map/000012.png     8 bit
+
+recorder.py writes it. Depth and class images may lie beside these; nothing here reads them.
+"""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+import pathlib
+import warnings
+from collections.abc import Callable
+
+import numpy as np
+
+from muvo_jax import config as config_lib
+from muvo_jax.data import files, schema
+
+SCHEMA_VERSION = 1
+DESCRIPTION_FILE = "recording.toml"
+FRAMES_FILE = "frames.csv"
+# RawFrame key -> (folder, suffix) of the modalities that are files.
+_FILES = {"image": ("image", ".png"), "points_m": ("lidar", ".npz"), "occupancy": ("occupancy", ".npz"),
+          "route_map": ("route_map", ".png")}
+_COLUMNS = ("frame_id", "timestamp_s", "speed_mps", "acceleration", "steering")
+_OPTIONAL_COLUMNS = ("reward", "is_terminal")
+
+
+@dataclasses.dataclass(frozen=True)
+class _Run:
+    split: str
+    folder: pathlib.Path
+    columns: dict[str, np.ndarray]  # name -> [F]
+
+
+class PlainRecording:
+    """A folder in the plain format."""
+
+    def __init__(self, path: pathlib.Path | str):
+        """Reads the description and every frames.csv, and looks which files exist; frames are read by `read`.
+
+        Raises:
+          DataError: for a description of another version or with wrong fields, no complete run, or a malformed
+            frames.csv.
+        """
+        root = pathlib.Path(path)
+        toml_path = root / DESCRIPTION_FILE
+        header = files.read_toml(toml_path)
+        if header.get("schema_version") != SCHEMA_VERSION:
+            raise schema.DataError(f"{toml_path}: schema_version is {header.get('schema_version')!r}, this reader "
+                                   f"knows {SCHEMA_VERSION}. Record it again, or use the muvo_jax that wrote it.")
+        splits = tuple(_field(header, "splits", list, toml_path))
+        runs = [run for split in splits for run in _read_runs(root, split)]
+        if not runs:
+            raise schema.DataError(f"{root}: no complete run (a folder <split>/<run> with {FRAMES_FILE}) in the splits "
+                                   f"{', '.join(splits)}. The root holds {files.listing(root)}. Record it again.")
+        rate_hz = float(_field(header, "rate_hz", (int, float), toml_path))
+        modalities = _modalities(runs)
+        self._runs = {f"{run.split}/{run.folder.name}": run for run in runs}
+        self.sequences = tuple(sequence for name, run in self._runs.items()
+                               for sequence in _cut(run, name, modalities, 1.0 / rate_hz))
+        lidar = _section(header, "lidar", config_lib.RangeViewGeometry, toml_path, "points_m" in modalities)
+        voxels = _section(header, "voxels", config_lib.VoxelGrid, toml_path, "occupancy" in modalities)
+        contract = _section(header, "action", config_lib.ActionContract, toml_path, required=True)
+        camera = _section(header, "camera", schema.Camera, toml_path, "image" in modalities)
+        if camera is not None:
+            _check_matrix(camera.intrinsics, 3, f"{toml_path}: camera.intrinsics")
+            _check_matrix(camera.camera_to_ego, 4, f"{toml_path}: camera.camera_to_ego")
+        self.description = schema.RecordingDescription(
+            name=str(_field(header, "name", str, toml_path)), kind="plain", rate_hz=rate_hz, camera=camera, lidar=lidar,
+            voxels=voxels, contract=contract, modalities=modalities, splits=splits)
+
+    def read(self, sequence: schema.Sequence, index: int) -> schema.RawFrame:
+        """See schema.Recording."""
+        run = self._runs[sequence.name]
+        position = sequence.start + index
+        columns, description = run.columns, self.description
+        frame_id = int(columns["frame_id"][position])
+        frame: schema.RawFrame = {
+            "speed_mps": np.float32(columns["speed_mps"][position]),
+            "action": np.array([columns["acceleration"][position], columns["steering"][position]], np.float32),
+            "timestamp_s": np.float64(columns["timestamp_s"][position]),
+            "frame_id": np.int64(frame_id),
+        }
+        if "reward" in description.modalities:
+            frame["reward"] = np.float32(columns["reward"][position])
+        if "is_terminal" in description.modalities:
+            frame["is_terminal"] = np.bool_(columns["is_terminal"][position])
+        paths = {key: run.folder / folder / f"{frame_id:06d}{suffix}" for key, (folder, suffix) in _FILES.items()
+                 if key in description.modalities}
+        if description.camera is not None and "image" in paths:
+            camera = description.camera
+            frame["image"] = files.read_png(paths["image"], "RGB")
+            _check_shape(frame["image"], (camera.height_px, camera.width_px, 3), paths["image"])
+            frame["intrinsics"] = np.asarray(camera.intrinsics, np.float32)
+            frame["camera_to_ego"] = np.asarray(camera.camera_to_ego, np.float32)
+        if "points_m" in paths:
+            points_m = files.read_npz(paths["points_m"], "points_m")
+            _check_shape(points_m, (len(points_m), 3), paths["points_m"])
+            frame["points_m"] = files.finite_points(points_m.astype(np.float32, copy=False), paths["points_m"])
+        if description.voxels is not None and "occupancy" in paths:
+            frame["occupancy"] = files.read_npz(paths["occupancy"], "occupancy").astype(np.uint8, copy=False)
+            _check_shape(frame["occupancy"], description.voxels.shape, paths["occupancy"])
+        if "route_map" in paths:
+            frame["route_map"] = files.read_png(paths["route_map"], "L")
+            _check_shape(frame["route_map"], (64, 64), paths["route_map"])
+        return frame
+
+
+def _field(header: dict, name: str, kind: type | tuple[type, ...], path: pathlib.Path):
+    if not isinstance(header.get(name), kind):
+        raise schema.DataError(f"{path}: {name} is {header.get(name)!r}, expected "
+                               f"{getattr(kind, '__name__', 'a number')}.")
+    return header[name]
+
+
+def _section(header: dict, name: str, cls: Callable, path: pathlib.Path, required: bool):
+    """One table of the description as a dataclass; None where it is neither there nor required."""
+    if name not in header:
+        if required:
+            raise schema.DataError(f"{path}: section [{name}] is missing, although there is data that needs it.")
+        return None
+    try:
+        return config_lib.parse(cls, header[name], f"{path}: {name}")
+    except (TypeError, ValueError) as error:
+        raise schema.DataError(str(error)) from error
+
+
+def _check_matrix(rows: tuple[tuple[float, ...], ...], size: int, where: str) -> None:
+    if [len(row) for row in rows] != [size] * size:
+        raise schema.DataError(f"{where}: got {rows}, expected {size} rows of {size} numbers.")
+
+
+def _check_shape(array: np.ndarray, expected: tuple[int, ...], path: pathlib.Path) -> None:
+    if array.shape != expected:
+        raise schema.DataError(f"{path}: shape {list(array.shape)}, but {DESCRIPTION_FILE} says {list(expected)}. Do "
+                               f"not mix recordings of different settings in one folder.")
+
+
+def _read_runs(root: pathlib.Path, split: str) -> list[_Run]:
+    """The complete runs of a split, in the order of their names; incomplete ones are left out with a warning."""
+    folders = sorted(path for path in (root / split).glob("*") if path.is_dir())
+    incomplete = [folder.name for folder in folders if not (folder / FRAMES_FILE).is_file()]
+    if incomplete:
+        warnings.warn(f"{root / split}: {len(incomplete)} of {len(folders)} runs have no {FRAMES_FILE}, are left out "
+                      f"as incomplete: {', '.join(incomplete[:6])}.", schema.DataWarning, stacklevel=3)
+    return [_Run(split, folder, _read_table(folder / FRAMES_FILE)) for folder in folders
+            if (folder / FRAMES_FILE).is_file()]
+
+
+def _read_table(path: pathlib.Path) -> dict[str, np.ndarray]:
+    with path.open(newline="", encoding="utf-8") as file:
+        reader = csv.DictReader(file)
+        rows = list(reader)
+        header = reader.fieldnames or ()
+    lacking = [name for name in _COLUMNS if name not in header]
+    if lacking:
+        raise schema.DataError(f"{path}: column {', '.join(lacking)} is missing; the header has "
+                               f"{', '.join(header) or 'none'}. Record the run again.")
+    optional = tuple(name for name in _OPTIONAL_COLUMNS if name in header and rows and rows[0][name])
+    columns = {name: np.array([_number(path, line, name, row[name]) for line, row in enumerate(rows, start=2)])
+               for name in _COLUMNS + optional}
+    files.check_increasing(columns["timestamp_s"], [f"{path}, line {line + 2}" for line in range(len(rows))])
+    return columns
+
+
+def _number(path: pathlib.Path, line: int, name: str, text: str | None) -> float:
+    words = {"true": 1.0, "false": 0.0}
+    try:
+        value = words.get((text or "").lower())
+        value = float(text or "") if value is None else value
+    except ValueError:
+        value = np.nan
+    if not np.isfinite(value):
+        raise schema.DataError(f"{path}, line {line}: {name} is {text!r}, expected a finite number.")
+    return value
+
+
+def _modalities(runs: list[_Run]) -> frozenset[str]:
+    """The keys of RawFrame that at least one run has; where another run lacks one, its frames are left out."""
+    names = {"speed_mps", "action", "timestamp_s", "frame_id"}
+    names |= {key for key, (folder, _) in _FILES.items() if any((run.folder / folder).is_dir() for run in runs)}
+    names |= {name for name in _OPTIONAL_COLUMNS if all(name in run.columns for run in runs)}
+    if "image" in names:
+        names |= {"intrinsics", "camera_to_ego"}
+    return frozenset(names)
+
+
+def _cut(run: _Run, name: str, modalities: frozenset[str], period_s: float) -> list[schema.Sequence]:
+    """The gap-free sequences of a run (a terminal frame ends one); warns of frames that lack a file."""
+    frame_ids = run.columns["frame_id"].astype(np.int64).tolist()
+    absent = {}
+    present = np.ones(len(frame_ids), bool)
+    for key, (folder, suffix) in _FILES.items():
+        if key in modalities:
+            have = files.numbered(run.folder / folder, suffix)
+            there = np.array([frame_id in have for frame_id in frame_ids], bool)
+            present &= there
+            absent[folder] = int((~there).sum())
+    restarts = np.zeros(len(frame_ids), bool)
+    if "is_terminal" in modalities:
+        restarts[1:] = run.columns["is_terminal"][:-1] > 0
+    pieces = files.gap_free(present, run.columns["timestamp_s"], period_s, restarts)
+    if not present.all():
+        lacking = ", ".join(f"{count} in {folder}" for folder, count in absent.items() if count)
+        warnings.warn(f"{run.folder}: {int((~present).sum())} of {len(present)} frames are left out because a file is "
+                      f"missing ({lacking}); what is left makes {len(pieces)} gap-free sequences.",
+                      schema.DataWarning, stacklevel=3)
+    return [schema.Sequence(split=run.split, name=name, start=start, length=length) for start, length in pieces]

@@ -1,0 +1,191 @@
+"""From a recording's raw frames to what the model eats, and from a preset to what the recording offers.
+
+Images are scaled by width and cropped at the bottom; the range view has the preset's size and the recorded lidar's
+field of view and mounting; occupancy is the recorded one or, where none is recorded, what the frame's own scan hit
+(occupied) and looked through (empty), everything else unknown.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Collection
+from typing import NamedTuple
+
+import numpy as np
+
+from muvo_jax import config as config_lib
+from muvo_jax.data import schema
+from muvo_jax.ops import camera as camera_ops
+from muvo_jax.ops import range_view as range_view_ops
+from muvo_jax.ops import voxels as voxel_ops
+
+SHORT_RECORDING_FRAMES = 100
+# What a short recording is cut into: 0.4 s observed and 0.4 s imagined at 10 Hz.
+_SHORT = {"stride": 1, "context": 4, "horizon": 4, "frames": 8}
+_ROW_MULTIPLE = 32
+
+PreparedFrame = dict[str, np.ndarray | np.generic]  # names and dtypes of types.Batch without B and T
+
+
+class Adapted(NamedTuple):
+    """A config that fits a recording.
+
+    Attributes:
+      config: the config.
+      notes: sentences about what was changed and why, for whoever starts the run.
+    """
+
+    config: config_lib.Config
+    notes: tuple[str, ...]
+
+
+def adapt(config: config_lib.Config, recording: schema.Recording, *, keep: Collection[str] = ()) -> Adapted:
+    """Fits a config to a recording: sensor geometry, action contract, heads, inputs and window lengths.
+
+    Adapting twice changes nothing more.
+
+    Args:
+      keep: dotted names, such as "data.stride", that the user chose; they are left alone.
+
+    Raises:
+      DataError: where the recording lacks what every model needs (camera, lidar, actions), its image is too flat, its
+        voxel grid does not suit the voxel decoder, or its sequences are shorter than a window.
+    """
+    description = recording.description
+    notes: list[str] = []
+    model = _fit_model(config.model, description, notes)
+    data = _fit_windows(config.data, recording, keep, notes)
+    return Adapted(dataclasses.replace(config, model=model, data=data, contract=description.contract), tuple(notes))
+
+
+def prepare_frame(raw: schema.RawFrame, config: config_lib.Config) -> PreparedFrame:
+    """Returns the arrays of one frame by their names in types.Batch, plus timestamp_s and frame_id for the host.
+
+    Args:
+      raw: one frame of the recording that `config` was adapted to.
+
+    Raises:
+      DataError: where the frame does not fit the config, naming frame and field.
+    """
+    model = config.model
+    ready: PreparedFrame = {name: raw[name] for name in ("action", "timestamp_s", "frame_id")}
+    try:
+        ready["image"], ready["intrinsics"] = camera_ops.resize_crop(raw["image"], raw["intrinsics"], model.image_size)
+        ready["range_view"] = range_view_ops.project(raw["points_m"], model.range_view)
+        if "occupancy" in model.heads:
+            ready["occupancy"] = _occupancy(raw, model)
+    except ValueError as error:
+        raise schema.DataError(f"frame {int(raw['frame_id'])}: {error}") from error
+    ready["camera_to_ego"] = raw["camera_to_ego"]
+    if model.route:
+        ready["route_map"] = raw["route_map"]
+    if model.speed:
+        ready["speed_mps"] = raw["speed_mps"]
+    for name in ("reward", "is_terminal"):
+        if name in raw:
+            ready[name] = raw[name]
+    return ready
+
+
+def _occupancy(raw: schema.RawFrame, model: config_lib.ModelConfig) -> np.ndarray:
+    if "occupancy" not in raw:
+        lidar_m = np.array(model.range_view.position_m, np.float32)
+        return voxel_ops.occupancy_target(raw["points_m"], lidar_m, model.voxels)
+    if raw["occupancy"].shape != model.voxels.shape:
+        raise ValueError(f"occupancy has shape {list(raw['occupancy'].shape)}, model.voxels "
+                         f"{list(model.voxels.shape)}; adapt the config to the recording first.")
+    return raw["occupancy"]
+
+
+def _fit_model(model: config_lib.ModelConfig, description: schema.RecordingDescription,
+               notes: list[str]) -> config_lib.ModelConfig:
+    camera, lidar = description.camera, description.lidar
+    lacking = sorted({"image", "points_m", "action"} - description.modalities)
+    if camera is None or lidar is None or lacking:
+        raise schema.DataError(f"recording {description.name!r} lacks {', '.join(lacking) or 'a sensor description'}; "
+                               f"every model needs camera, lidar and actions. Record these too.")
+    heads = model.heads
+    changes: dict = {"image_size": _image_size(camera, model.image_size[1])}
+    changes["range_view"] = dataclasses.replace(lidar, rows=model.range_view.rows, columns=model.range_view.columns)
+    if description.voxels is not None and "occupancy" in heads:
+        changes["voxels"] = description.voxels
+        changes["occupancy_blocks"] = _occupancy_blocks(model.occupancy_blocks, description.voxels)
+        if changes["occupancy_blocks"] != model.occupancy_blocks:
+            notes.append(f"the voxel decoder has {changes['occupancy_blocks']} full-width stages instead of "
+                         f"{model.occupancy_blocks}: the recorded grid is only {_by(description.voxels.shape)}.")
+    elif "occupancy" in heads:
+        notes.append("no occupancy is recorded: the target is what each lidar scan hit and looked through, unknown "
+                     "elsewhere.")
+    if model.route and "route_map" not in description.modalities:
+        changes["route"] = False
+        notes.append("no route map is recorded: the model has no route input.")
+    if model.speed and "speed_mps" not in description.modalities:
+        changes["speed"] = False
+        notes.append("no speed is recorded: the model has no speed input.")
+    if changes["image_size"] != model.image_size:
+        notes.append(f"images of {camera.width_px}x{camera.height_px} pixels become {changes['image_size'][1]}x"
+                     f"{changes['image_size'][0]}: scaled by width, rows cut off at the top.")
+    return dataclasses.replace(model, **changes)
+
+
+def _image_size(camera: schema.Camera, columns: int) -> tuple[int, int]:
+    """The preset's width and the largest multiple of 32 rows that the scaled image has."""
+    scaled_rows = round(camera.height_px * columns / camera.width_px)
+    rows = scaled_rows // _ROW_MULTIPLE * _ROW_MULTIPLE
+    if not rows:
+        raise schema.DataError(f"images of {camera.width_px}x{camera.height_px} pixels have {scaled_rows} rows when "
+                               f"scaled to {columns} columns; at least {_ROW_MULTIPLE} are needed. Choose a preset "
+                               f"with wider images, or record higher ones.")
+    return rows, columns
+
+
+def _occupancy_blocks(wanted: int, grid: config_lib.VoxelGrid) -> int:
+    """The most full-width decoder stages, up to `wanted`, that halve down to whole voxels."""
+    for blocks in range(wanted, 0, -1):
+        if all(side % 2 ** (blocks + 3) == 0 for side in grid.shape):
+            return blocks
+    raise schema.DataError(f"the recorded voxel grid of {_by(grid.shape)} does not suit the voxel decoder: each "
+                           f"side must be a multiple of 16. Record another grid, or leave the occupancy head out.")
+
+
+def _by(shape: tuple[int, ...]) -> str:
+    return "x".join(map(str, shape))
+
+
+def _fit_windows(data: config_lib.DataConfig, recording: schema.Recording, keep: Collection[str],
+                 notes: list[str]) -> config_lib.DataConfig:
+    lengths = {split: schema.longest(recording.sequences, split) for split in recording.description.splits}
+    if lengths.get("train", 0) < SHORT_RECORDING_FRAMES and _too_long(data, lengths):
+        changes: dict = {name: value for name, value in _SHORT.items() if f"data.{name}" not in keep}
+        data = dataclasses.replace(data, **changes)
+        notes.append(f"short recording (longest training sequence: {lengths.get('train', 0)} frames): "
+                     f"stride {data.stride}, context {data.context}, horizon {data.horizon}, {data.frames} frames to "
+                     f"train on.")
+    split = _too_long(data, lengths)
+    if split:
+        frames = data.frames if split == "train" else data.context + data.horizon
+        raise too_short(recording, split, frames, data.stride)
+    return data
+
+
+def _too_long(data: config_lib.DataConfig, lengths: dict[str, int]) -> str | None:
+    """The first split whose longest sequence is shorter than a window."""
+    for split, length in lengths.items():
+        frames = data.frames if split == "train" else data.context + data.horizon
+        if length < span(frames, data.stride):
+            return split
+    return None
+
+
+def span(frames: int, stride: int) -> int:
+    """Recorded frames from the first to the last of a window."""
+    return (frames - 1) * stride + 1
+
+
+def too_short(recording: schema.Recording, split: str, frames: int, stride: int) -> schema.DataError:
+    """The error for a split without a single window; names both lengths."""
+    found = schema.longest(recording.sequences, split)
+    return schema.DataError(f"recording {recording.description.name!r}: the longest gap-free sequence of split "
+                            f"{split!r} has {found} frames, but a window of {frames} frames at stride {stride} needs "
+                            f"{span(frames, stride)}. Choose fewer frames (data.frames, data.context, data.horizon) or "
+                            f"a smaller data.stride, or record longer runs.")

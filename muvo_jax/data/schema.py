@@ -1,0 +1,135 @@
+"""What a recording is, whatever its format: a description, gap-free sequences and raw frames.
+
+A reader (plain.py, kitti.py) turns a folder into a `Recording`; prepare.py turns raw frames into what the model eats;
+pipeline.py cuts windows. Ego frame and time convention: muvo_jax.types.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Protocol, TypedDict
+
+import numpy as np
+
+from muvo_jax import config as config_lib
+
+
+class DataError(ValueError):
+    """Recorded data that cannot be used; the message names the file, what was expected and how to go on."""
+
+
+class DataWarning(UserWarning):
+    """Recorded data that can be used in part; the message counts what is left out."""
+
+
+class RawFrame(TypedDict, total=False):
+    """One frame as recorded. A modality that the recording lacks has no key.
+
+    Keys:
+      image: uint8 [H, W, 3], RGB.
+      intrinsics: float32 [3, 3], of `image`.
+      camera_to_ego: float32 [4, 4].
+      points_m: float32 [N, 3], ego frame.
+      occupancy: uint8 [X, Y, Z], 0 empty, 1 occupied, 255 unknown, in the grid `RecordingDescription.voxels`.
+      route_map: uint8 [64, 64].
+      action: float32 [2], applied from this frame to the next.
+      speed_mps, reward, is_terminal, timestamp_s: scalars.
+      frame_id: the recording's own number.
+    """
+
+    image: np.ndarray
+    intrinsics: np.ndarray
+    camera_to_ego: np.ndarray
+    points_m: np.ndarray
+    occupancy: np.ndarray
+    route_map: np.ndarray
+    speed_mps: np.float32
+    action: np.ndarray
+    reward: np.float32
+    is_terminal: np.bool_
+    timestamp_s: np.float64
+    frame_id: np.int64
+
+
+@dataclasses.dataclass(frozen=True)
+class Camera:
+    """A pinhole camera without distortion: x right, y down, z forward.
+
+    Attributes:
+      width_px, height_px: size of the recorded image.
+      intrinsics: 3x3 rows, pixels.
+      camera_to_ego: 4x4 rows, metres.
+    """
+
+    width_px: int
+    height_px: int
+    intrinsics: tuple[tuple[float, ...], ...]
+    camera_to_ego: tuple[tuple[float, ...], ...]
+
+
+@dataclasses.dataclass(frozen=True)
+class Sequence:
+    """A run of consecutive frames without a gap, a restart or a change of split; windows stay inside one.
+
+    Attributes:
+      split: "train", "val", "val_rl" or "val_ds".
+      name: the run it comes from.
+      start: index within the run of its first frame.
+      length: number of frames.
+    """
+
+    split: str
+    name: str
+    start: int
+    length: int
+
+
+@dataclasses.dataclass(frozen=True)
+class RecordingDescription:
+    """What holds for all of a recording.
+
+    Attributes:
+      name, kind: what it is called, and the format it was recognised as.
+      rate_hz: recorded frames per second.
+      camera: None without images.
+      lidar: field of view and mounting, with the sensor's own rows and columns; None without points.
+      voxels: the grid of stored occupancy; None where none is stored.
+      contract: what an action means.
+      modalities: the keys of RawFrame that every frame has.
+      splits: in the order in which they should be reported.
+      notes: sentences that whoever starts a run should read.
+    """
+
+    name: str
+    kind: str
+    rate_hz: float
+    camera: Camera | None
+    lidar: config_lib.RangeViewGeometry | None
+    voxels: config_lib.VoxelGrid | None
+    contract: config_lib.ActionContract
+    modalities: frozenset[str]
+    splits: tuple[str, ...]
+    notes: tuple[str, ...] = ()
+
+
+class Recording(Protocol):
+    """What a reader offers. `read` is called from several threads at once."""
+
+    @property
+    def description(self) -> RecordingDescription: ...
+
+    @property
+    def sequences(self) -> tuple[Sequence, ...]: ...
+
+    def read(self, sequence: Sequence, index: int) -> RawFrame:
+        """Returns frame `index` (0 is the first) of `sequence`.
+
+        Raises:
+          DataError: naming the file that is missing, truncated or of another shape than the rest.
+        """
+        ...
+
+
+def longest(sequences: tuple[Sequence, ...], split: str) -> int:
+    """Frames in the longest sequence of a split, 0 where it has none."""
+    return max((sequence.length for sequence in sequences if sequence.split == split), default=0)

@@ -1,0 +1,56 @@
+"""Recognises what kind of recording a folder is. One more format is one more entry of KINDS."""
+
+from __future__ import annotations
+
+import pathlib
+from collections.abc import Callable
+from typing import NamedTuple
+
+from muvo_jax.data import files, kitti, plain, schema
+
+
+class Kind(NamedTuple):
+    """A recording format.
+
+    Attributes:
+      name: for messages.
+      layout: how a folder of this kind is recognised, for messages.
+      matches: whether a folder is one.
+      open: its reader.
+    """
+
+    name: str
+    layout: str
+    matches: Callable[[pathlib.Path], bool]
+    open: Callable[[pathlib.Path], schema.Recording]
+
+
+KINDS = (
+    Kind("plain", f"a folder with {plain.DESCRIPTION_FILE}",
+         lambda path: (path / plain.DESCRIPTION_FILE).is_file(), plain.PlainRecording),
+    Kind("KITTI raw", "<date>/<date>_drive_NNNN_sync folders, or one of them",
+         lambda path: bool(kitti.find_drives(path)), kitti.KittiRecording),
+)
+
+
+def open_recording(path: pathlib.Path | str) -> schema.Recording:
+    """Opens a folder with the reader of its kind (the built-in town is a plain recording in its cache folder).
+
+    Raises:
+      DataError: for a path that is missing, a file, empty or of no known kind (naming the kinds and what was found), or
+        what the reader objects to.
+    """
+    path = pathlib.Path(path).expanduser()
+    known = "; ".join(f"{kind.name} ({kind.layout})" for kind in KINDS)
+    if not path.exists():
+        raise schema.DataError(f"data folder {path} does not exist. Expected a recording: {known}; or \"town\", the "
+                               f"built-in world.")
+    if not path.is_dir():
+        raise schema.DataError(f"{path} is a file; expected the folder of a recording: {known}.")
+    if not any(path.iterdir()):
+        raise schema.DataError(f"data folder {path} is empty. Expected a recording: {known}; or \"town\", the built-in "
+                               f"world.")
+    for kind in KINDS:
+        if kind.matches(path):
+            return kind.open(path)
+    raise schema.DataError(f"data folder {path} is of no known kind. Known are {known}. Found {files.listing(path)}.")

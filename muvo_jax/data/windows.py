@@ -1,0 +1,94 @@
+"""Windows of evenly spaced frames inside gap-free sequences, and a bounded cache of the frames they share."""
+
+from __future__ import annotations
+
+import collections
+import dataclasses
+import threading
+from collections.abc import Callable, Hashable
+
+import numpy as np
+
+from muvo_jax.data import prepare, schema
+
+
+@dataclasses.dataclass(frozen=True)
+class Window:
+    """`frames` frames of one sequence, the first at `start`, each `stride` recorded frames after the one before."""
+
+    sequence: schema.Sequence
+    start: int
+    frames: int
+    stride: int
+
+    @property
+    def indices(self) -> range:
+        """Indices of the frames within the sequence."""
+        return range(self.start, self.start + prepare.span(self.frames, self.stride), self.stride)
+
+
+def find_windows(recording: schema.Recording, split: str, *, frames: int, stride: int) -> tuple[Window, ...]:
+    """All windows of a split that fit into a sequence, in recorded order.
+
+    Raises:
+      DataError: for an unknown split, or where every sequence is shorter than the window (naming both lengths).
+    """
+    if split not in recording.description.splits:
+        raise schema.DataError(f"recording {recording.description.name!r} has no split {split!r}; it has "
+                               f"{', '.join(recording.description.splits)}.")
+    found = tuple(Window(sequence, start, frames, stride) for sequence in recording.sequences if sequence.split == split
+                  for start in range(sequence.length - prepare.span(frames, stride) + 1))
+    if not found:
+        raise prepare.too_short(recording, split, frames, stride)
+    return found
+
+
+def spread(windows: tuple[Window, ...], count: int) -> tuple[Window, ...]:
+    """At most `count` of the windows (0: all), evenly spread over them, first and last included."""
+    if count == 0 or count >= len(windows):
+        return windows
+    picked = np.linspace(0, len(windows) - 1, count).round().astype(int)
+    return tuple(windows[index] for index in picked)
+
+
+class FrameCache:
+    """Prepared frames by key, the least recently used dropped first; safe to use from several threads.
+
+    A frame larger than the whole cache is made every time and not kept.
+    """
+
+    def __init__(self, limit_bytes: int):
+        self._limit_bytes = limit_bytes
+        self._frames: collections.OrderedDict[Hashable, prepare.PreparedFrame] = collections.OrderedDict()
+        self._lock = threading.Lock()
+        self._bytes = 0
+
+    @property
+    def bytes_used(self) -> int:
+        """Size of all arrays kept; never above the limit."""
+        return self._bytes
+
+    def get(self, key: Hashable, make: Callable[[], prepare.PreparedFrame]) -> prepare.PreparedFrame:
+        """Returns the frame of that key, made now if it is not kept. Its arrays are shared: do not write to them.
+
+        Two threads that miss the same key at once may both make it; the frames are equal.
+        """
+        with self._lock:
+            frame = self._frames.get(key)
+            if frame is not None:
+                self._frames.move_to_end(key)
+                return frame
+        frame = make()
+        size = _size_bytes(frame)
+        with self._lock:
+            if size <= self._limit_bytes and key not in self._frames:
+                self._frames[key] = frame
+                self._bytes += size
+                while self._bytes > self._limit_bytes:
+                    _, dropped = self._frames.popitem(last=False)
+                    self._bytes -= _size_bytes(dropped)
+        return frame
+
+
+def _size_bytes(frame: prepare.PreparedFrame) -> int:
+    return sum(np.asarray(value).nbytes for value in frame.values())

@@ -1,0 +1,134 @@
+"""The reference's parameter names and layouts, and ours: a released 1D checkpoint becomes variables of WorldModel.
+
+Ours are translated to theirs by the rules below, so that what a checkpoint lacks and what nothing asks for are both named.
+Layouts: torch keeps (O, I, *K) for convolutions, (I, O, *K) for transposed ones and (O, I) for dense layers; here it is
+[*K, I, O] and [I, O] throughout.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import jax
+import numpy as np
+
+from muvo_jax.config import ModelConfig
+from muvo_jax.model import world_model
+
+# Applied in turn to "module/module/leaf"; what remains of "/" becomes ".".
+_RULES: tuple[tuple[str, str | Callable[[re.Match[str]], str]], ...] = (
+    (r"^camera/backbone", "encoder"),
+    (r"^camera/neck", "feat_decoder"),
+    (r"^lidar/backbone", "range_view_encoder"),
+    (r"^lidar/neck", "range_view_decoder"),
+    (r"^route/backbone", "backbone_route/backbone"),
+    (r"^route/linear", "backbone_route/fc"),
+    (r"^speed/mlp/linear(\d)", lambda match: f"speed_enc/{2 * int(match[1])}"),
+    (r"decoder/level0/", "decoder/conv1/"),
+    (r"decoder/level(\d)/", lambda match: f"decoder/downsample_skip_convs/{int(match[1]) - 1}/"),
+    (r"(conv1|convs/\d)/conv/", r"\1/0/"),
+    (r"(conv1|convs/\d)/norm/", r"\1/1/"),
+    (r"layer(\d)_(\d)", r"layer\1/\2"),
+    (r"downsample_conv", "downsample/0"),
+    (r"downsample_norm", "downsample/1"),
+    (r"^fusion/transformer/layer(\d+)", r"transformer_encoder/layers/\1"),
+    (r"^fusion/(image|lidar)_compression/block(\d)", r"\1_feature_conv/\2"),
+    (r"^fusion/combine", "features_combine"),
+    (r"^fusion/", ""),
+    (r"^transition/pre_gru", "rssm/pre_gru_net/0"),
+    (r"^transition/gru/input_kernel", "rssm/recurrent_model/weight_ih"),
+    (r"^transition/gru/hidden_kernel", "rssm/recurrent_model/weight_hh"),
+    (r"^transition/gru/input_bias", "rssm/recurrent_model/bias_ih"),
+    (r"^transition/gru/hidden_bias", "rssm/recurrent_model/bias_hh"),
+    (r"^transition/(prior|posterior)/action", r"rssm/\1_action_module/0"),
+    (r"^transition/(prior|posterior)/hidden", r"rssm/\1/module/0"),
+    (r"^transition/(prior|posterior)/out", r"rssm/\1/module/2"),
+    (r"^decoders_action/mlp/linear(\d)", lambda match: f"policy/fc/{2 * int(match[1])}"),
+    (r"^decoders_image/(head_\d)", r"rgb_decoder/\1/rgb_head/0"),
+    (r"^decoders_range_view/(head_\d)", r"lidar_re/\1/lidar_re_head/0"),
+    (r"^decoders_image/", "rgb_decoder/"),
+    (r"^decoders_range_view/", "lidar_re/"),
+    (r"^(rgb_decoder|lidar_re)/linear", r"\1/linear/0"),
+    (r"^(rgb_decoder|lidar_re)/seed", r"\1/pre_transpose_conv/0"),
+    (r"^(rgb_decoder|lidar_re)/up([012])/conv", lambda match: f"{match[1]}/pre_transpose_conv/{2 * int(match[2]) + 2}"),
+    (r"^(rgb_decoder|lidar_re)/up([345])/conv", lambda match: f"{match[1]}/trans_conv{int(match[2]) - 2}/0"),
+    (r"^decoders_occupancy/(head_\d)", r"voxel_decoder/\1/segmentation_head/0"),
+    (r"^decoders_occupancy/constant", "voxel_decoder/constant_tensor"),
+    (r"^decoders_occupancy/block(\d)", r"voxel_decoder/middle_conv/\1"),
+    (r"^decoders_occupancy/up_(\d)", lambda match: f"voxel_decoder/conv{ {4: 1, 2: 2, 1: 3}[int(match[1])] }"),
+    (r"^decoders_occupancy/", "voxel_decoder/"),
+    (r"^(voxel_decoder/.*(?:first_conv|conv\d))/(?:conv|0)/", r"\1/conv_act/0/"),
+    (r"^(voxel_decoder/.*(?:first_conv|conv\d))/(?:norm|1)/style", r"\1/adaptive_norm/latent_affine"),
+    (r"^voxel_decoder/first_norm/style", "voxel_decoder/first_norm/latent_affine"),
+    (r"in_proj/kernel$", "in_proj_weight"),
+    (r"in_proj/bias$", "in_proj_bias"),
+    (r"/(kernel|seed_kernel|transposed_kernel|scale)$", "/weight"),
+    (r"/mean$", "/running_mean"),
+    (r"/var$", "/running_var"),
+)
+
+# In every checkpoint and used by nothing: BatchNorm's counters, and the layer that the transformer was copied from.
+_UNUSED = re.compile(r"^encoder_layer\.|\.num_batches_tracked$")
+
+
+def reference_key(path: str) -> str:
+    """The reference's state_dict key of one of our variables, "fusion/combine/kernel" -> "features_combine.weight"."""
+    for pattern, replacement in _RULES:
+        path = re.sub(pattern, replacement, path)
+    return path.replace("/", ".")
+
+
+def to_our_layout(leaf: str, shape: tuple[int, ...], value: np.ndarray) -> np.ndarray:
+    """A reference array in the layout of our variable called `leaf` with `shape`."""
+    if leaf == "type_embedding":
+        return value[0, 0].T
+    if leaf == "constant":
+        return np.moveaxis(value, 0, -1)
+    if leaf in ("seed_kernel", "transposed_kernel"):
+        return np.moveaxis(value, (0, 1), (-2, -1))
+    if leaf == "kernel" and len(shape) == 2:
+        return value.reshape(value.shape[:2]).T  # 1x1 convolutions are dense layers here
+    if leaf.endswith("kernel"):
+        return np.moveaxis(value, (0, 1), (-1, -2))
+    return value
+
+
+def convert_state_dict(state_dict: Mapping[str, np.ndarray], model_config: ModelConfig) -> dict[str, Any]:
+    """Variables of WorldModel(model_config) with the reference's numbers.
+
+    Args:
+      state_dict: reference key (without "model.") -> array, in torch's layout.
+      model_config: must describe the same architecture; models trained by the reference want numerics="reference".
+
+    Returns:
+      {"params": ..., "batch_stats": ...} of contiguous float32 NumPy arrays.
+
+    Raises:
+      ValueError: naming the keys that are missing, unexpected, or of another shape than the configuration says.
+    """
+    shapes = world_model.WorldModel(model_config).variable_shapes()
+    leaves, structure = jax.tree_util.tree_flatten_with_path(shapes)
+    wanted = [("/".join(part.key for part in path[1:]), leaf.shape) for path, leaf in leaves]
+    keys = [reference_key(path) for path, _ in wanted]
+    missing = [key for key in keys if key not in state_dict]
+    unexpected = [key for key in state_dict if key not in set(keys) and not _UNUSED.search(key)]
+    values, misshapen = [], []
+    for key, (path, shape) in zip(keys, wanted, strict=True):
+        if key in missing:
+            continue
+        value = to_our_layout(path.rsplit("/")[-1], shape, np.asarray(state_dict[key]))
+        values.append(np.ascontiguousarray(value, np.float32))
+        if value.shape != shape:
+            misshapen.append(f"{key} {list(state_dict[key].shape)} (becomes {list(value.shape)}, wanted {list(shape)})")
+    problems = [f"{len(names)} {what}: {_listed(names)}" for what, names in
+                (("missing", missing), ("unexpected", unexpected), ("of another shape", misshapen)) if names]
+    if problems:
+        raise ValueError(f"The checkpoint does not fit the {model_config.variant} model ({model_config.latent}); "
+                         f"keys {'; '.join(problems)}. Check the heads and sizes of the model's configuration.")
+    return jax.tree_util.tree_unflatten(structure, values)
+
+
+def _listed(names: list[str], most: int = 8) -> str:
+    return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")

@@ -1,0 +1,99 @@
+"""What a prediction must beat: the last observed frame, and the mean of the training frames."""
+
+from __future__ import annotations
+
+import flax.struct
+import numpy as np
+
+from muvo_jax import types
+
+Frames = dict[str, np.ndarray]
+
+
+def copy_last(batch: types.Batch, context: int, horizon: int) -> tuple[Frames, int]:
+    """The last observed frame as the prediction of every later one.
+
+    An unknown voxel copies as empty: a prediction has to say something about every voxel.
+
+    Args:
+      batch: windows of at least `context` frames.
+      context: frames that were observed.
+      horizon: frames to predict.
+
+    Returns:
+      {"image": float32 [B, horizon, H, W, 3] in [0, 1], "range_view": float32 [...] in metres, "occupancy": bool [...]},
+      as read-only views without the modalities that the batch lacks, and the number of voxels copied from unknown
+      (of one frame per window).
+    """
+    last = {name: np.asarray(getattr(batch, name)[:, context - 1]) for name in ("image", "range_view", "occupancy")
+            if getattr(batch, name) is not None}
+    unknown = 0
+    if "image" in last:
+        last["image"] = last["image"].astype(np.float32) / 255.0
+    if "occupancy" in last:
+        unknown = int((last["occupancy"] == types.OCCUPANCY_UNKNOWN).sum())
+        last["occupancy"] = last["occupancy"] == types.OCCUPANCY_OCCUPIED
+    return {name: np.broadcast_to(value[:, None], (value.shape[0], horizon, *value.shape[1:]))
+            for name, value in last.items()}, unknown
+
+
+@flax.struct.dataclass
+class TrainingMean:
+    """Sums over training frames; every field is None for a modality that is absent.
+
+    Attributes:
+      frames: how many frames went in.
+      image: float64 [H, W, 3], sum of pixel values 0..255.
+      range_view: float64 [Hr, Wr, 4], sum over the frames in which the pixel has a return.
+      returned: int64 [Hr, Wr], how many these are.
+      occupied, known: int64 [X, Y, Z], frames in which the voxel is occupied, and in which it is not unknown.
+    """
+
+    frames: int = 0
+    image: np.ndarray | None = None
+    range_view: np.ndarray | None = None
+    returned: np.ndarray | None = None
+    occupied: np.ndarray | None = None
+    known: np.ndarray | None = None
+
+    def add(self, batch: types.Batch) -> TrainingMean:
+        """With all frames of a batch."""
+        sums = {"frames": batch.batch_size * batch.frames}
+        if batch.image is not None:
+            sums["image"] = np.asarray(batch.image).sum(axis=(0, 1), dtype=np.float64)
+        if batch.range_view is not None:
+            range_view = np.asarray(batch.range_view)
+            returned = range_view[..., 3] > 0.0
+            sums["range_view"] = np.where(returned[..., None], range_view, 0.0).sum(axis=(0, 1), dtype=np.float64)
+            sums["returned"] = returned.sum(axis=(0, 1), dtype=np.int64)
+        if batch.occupancy is not None:
+            occupancy = np.asarray(batch.occupancy)
+            sums["occupied"] = (occupancy == types.OCCUPANCY_OCCUPIED).sum(axis=(0, 1), dtype=np.int64)
+            sums["known"] = (occupancy != types.OCCUPANCY_UNKNOWN).sum(axis=(0, 1), dtype=np.int64)
+        before = {name: getattr(self, name) for name in sums}
+        return self.replace(**{name: value if before[name] is None else before[name] + value
+                               for name, value in sums.items()})
+
+    def prediction(self) -> Frames:
+        """The mean frame: {"image": float32 [H, W, 3] in [0, 1], "range_view": float32 [Hr, Wr, 4], "occupancy": bool}.
+
+        A pixel of the range view is the mean of its returns where more than half of the frames return, and a hole
+        (0, 0, 0, -1) elsewhere. A voxel is occupied where more than half of the frames that know it say so; one that no
+        frame knows is empty.
+
+        Raises:
+          ValueError: where no frame went in.
+        """
+        if not self.frames:
+            raise ValueError("training mean: no frame was added; add at least one batch before asking for the mean.")
+        mean: Frames = {}
+        if self.image is not None:
+            mean["image"] = (self.image / (255.0 * self.frames)).astype(np.float32)
+        if self.range_view is not None:
+            hole = np.array([0.0, 0.0, 0.0, types.RANGE_NO_RETURN_M])
+            returns = 2 * self.returned > self.frames
+            values = self.range_view / np.maximum(self.returned, 1)[..., None]
+            mean["range_view"] = np.where(returns[..., None], values, hole).astype(np.float32)
+        if self.occupied is not None:
+            mean["occupancy"] = 2 * self.occupied > self.known
+        return mean

@@ -1,0 +1,135 @@
+"""Decoders from the latent features to images, range views, voxels and actions (paper section III-D).
+
+Each maps features [N, F] to {scale: array}, scale 1 being the full size, 2 and 4 halved once and twice.
+"""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+from flax import linen
+
+from muvo_jax.nn import layers, norm
+from muvo_jax.ops import resample
+
+_PLANE_KERNELS = (5, 5, 6, 6, 6, 6)
+
+
+def plane_start(size: tuple[int, int]) -> tuple[tuple[int, int], tuple[int, int]]:
+    """Constant size and stride of the first stage, per axis, so that six stages end at `size` exactly.
+
+    A side that is a multiple of 64 starts at side / 64 and doubles six times, as in the reference (320 x 832 from 5 x 13).
+    One that is a multiple of 32 only starts at side / 32, and the first stage leaves it as it is.
+    """
+    halves = tuple(side % 64 == 0 for side in size)
+    start = tuple(side // 64 if even else side // 32 for side, even in zip(size, halves, strict=True))
+    return start, tuple(2 if even else 1 for even in halves)
+
+
+class UpStage(linen.Module):
+    """Transposed convolution, ELU."""
+
+    features: int
+    kernel: int
+    stride: tuple[int, int]
+    compute: layers.Compute = layers.Compute()
+
+    @linen.compact
+    def __call__(self, x: jax.Array) -> jax.Array:
+        return jax.nn.elu(layers.ConvTranspose(self.features, (self.kernel, self.kernel), self.stride, self.compute,
+                                               name="conv")(x))
+
+
+class PlaneDecoder(linen.Module):
+    """Features -> planes [N, H/scale, W/scale, channels] by a stack of transposed convolutions; no output activation."""
+
+    size: tuple[int, int]
+    channels: int
+    width: int
+    compute: layers.Compute = layers.Compute()
+    remat: bool = False
+
+    @linen.compact
+    def __call__(self, features: jax.Array) -> dict[int, jax.Array]:
+        start, first_stride = plane_start(self.size)
+        x = layers.Dense(self.width, self.compute, name="linear")(features)
+        x = jax.nn.elu(layers.Unfold(self.width, start, self.compute, name="seed")(x))
+        stage = linen.remat(UpStage) if self.remat else UpStage
+        widths = (self.width,) * 3 + (self.width // 2, self.width // 4, self.width // 8)
+        out = {}
+        for index, (width, kernel) in enumerate(zip(widths, _PLANE_KERNELS, strict=True)):
+            stride = first_stride if index == 0 else (2, 2)
+            x = stage(width, kernel, stride, self.compute, name=f"up{index}")(x)
+            if index >= 3:
+                scale = 2 ** (5 - index)
+                out[scale] = layers.Dense(self.channels, self.compute, name=f"head_{scale}")(x).astype(jnp.float32)
+        return out
+
+
+class StyledConv(linen.Module):
+    """3x3x3 convolution, leaky ReLU 0.2, adaptive instance norm."""
+
+    features: int
+    compute: layers.Compute = layers.Compute()
+
+    @linen.compact
+    def __call__(self, x: jax.Array, style: jax.Array) -> jax.Array:
+        x = jax.nn.leaky_relu(layers.Conv(self.features, (3, 3, 3), self.compute, name="conv")(x), 0.2)
+        return norm.AdaptiveInstanceNorm(self.compute, name="norm")(x, style)
+
+
+class StyledUpBlock(linen.Module):
+    """Trilinear doubling, then two styled convolutions."""
+
+    features: int
+    compute: layers.Compute = layers.Compute()
+
+    @linen.compact
+    def __call__(self, x: jax.Array, style: jax.Array) -> jax.Array:
+        x = resample.upsample_linear(x, factor=2)
+        x = StyledConv(self.features, self.compute, name="conv1")(x, style)
+        return StyledConv(self.features, self.compute, name="conv2")(x, style)
+
+
+class VoxelDecoder(linen.Module):
+    """Features -> class logits [N, X/scale, Y/scale, Z/scale, channels]: a learned constant grown under adaptive norms.
+
+    `blocks` doublings at full width, then three with half, a quarter and an eighth of it.
+    """
+
+    shape: tuple[int, int, int]
+    channels: int
+    width: int
+    blocks: int
+    compute: layers.Compute = layers.Compute()
+    remat: bool = False
+
+    @linen.compact
+    def __call__(self, features: jax.Array) -> dict[int, jax.Array]:
+        start = tuple(side // 2 ** (self.blocks + 3) for side in self.shape)
+        constant = self.param("constant", layers.shape_only, (*start, 2 * self.width)).astype(self.compute.dtype)
+        x = jnp.broadcast_to(constant[None], (features.shape[0], *constant.shape))
+        x = norm.AdaptiveInstanceNorm(self.compute, name="first_norm")(x, features)
+        x = StyledConv(self.width, self.compute, name="first_conv")(x, features)
+        block = linen.remat(StyledUpBlock) if self.remat else StyledUpBlock
+        for index in range(self.blocks):
+            x = block(self.width, self.compute, name=f"block{index}")(x, features)
+        out = {}
+        for scale, width in ((4, self.width // 2), (2, self.width // 4), (1, self.width // 8)):
+            x = block(width, self.compute, name=f"up_{scale}")(x, features)
+            out[scale] = layers.Dense(self.channels, self.compute, name=f"head_{scale}")(x).astype(jnp.float32)
+        return out
+
+
+class ActionDecoder(linen.Module):
+    """Features -> action [N, 2] in (-1, 1): a perceptron as wide as the features, the driver's behaviour cloned."""
+
+    compute: layers.Compute = layers.Compute()
+
+    @linen.compact
+    def __call__(self, features: jax.Array) -> dict[int, jax.Array]:
+        width = features.shape[-1]
+        out = layers.Mlp((width, width, width // 2, 2), self.compute, name="mlp")(features)
+        return {1: jnp.tanh(out.astype(jnp.float32))}
+
+

@@ -1,0 +1,57 @@
+"""Fusion of the sensors' maps and the measurements into one embedding per frame (paper section III-B, Table I)."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+from flax import linen
+
+from muvo_jax.config import ModelConfig
+from muvo_jax.model import common
+from muvo_jax.nn import attention, layers, norm, resnet
+
+
+class Compression(linen.Module):
+    """[N, H, W, C] -> [N, features]: a halving block, a block, the mean over the map."""
+
+    features: int
+    compute: layers.Compute = layers.Compute()
+
+    @linen.compact
+    def __call__(self, x: jax.Array, mode: norm.Mode) -> jax.Array:
+        x = resnet.BasicBlock(self.features, self.compute, stride=2, project=True, name="block0")(x, mode)
+        x = resnet.BasicBlock(self.features, self.compute, name="block1")(x, mode)
+        return jnp.mean(x, axis=(1, 2))
+
+
+class TransformerFusion(linen.Module):
+    """TR: the cells of both maps are tokens of one transformer; each sensor's tokens are then pooled to a vector.
+
+    Image and lidar maps [N, h, w, token_channels], measurements each [N, measurement_channels] -> [N, embedding_channels].
+    """
+
+    config: ModelConfig
+
+    @linen.compact
+    def __call__(self, image_map: jax.Array, lidar_map: jax.Array, measurements: list[jax.Array], mode: norm.Mode,
+                 keys: jax.Array | None) -> jax.Array:
+        config, compute = self.config, common.compute(self.config)
+        channels = config.token_channels
+        type_embedding = self.param("type_embedding", layers.shape_only, (2, channels))
+        tokens = []
+        for index, cells in enumerate((image_map, lidar_map)):
+            added = jnp.asarray(attention.sine_positions(cells.shape[1:3], channels)) + type_embedding[index][None]
+            tokens.append(cells.reshape(cells.shape[0], -1, channels) + added[None].astype(cells.dtype))
+        image_count = tokens[0].shape[1]
+        mixed = attention.TransformerEncoder(
+            config.transformer_layers, config.transformer_heads, config.transformer_hidden_channels, config.dropout,
+            compute, name="transformer")(jnp.concatenate(tokens, axis=1), keys)
+        image_vector = Compression(config.fused_channels, compute, name="image_compression")(
+            mixed[:, :image_count].reshape(image_map.shape), mode)
+        lidar_vector = Compression(config.fused_channels, compute, name="lidar_compression")(
+            mixed[:, image_count:].reshape(lidar_map.shape), mode)
+        joined = jnp.concatenate([image_vector, lidar_vector, *measurements], axis=-1)
+        return layers.Dense(config.embedding_channels, compute, name="combine")(joined).astype(jnp.float32)
+
+
+REGISTRY = {"tr": TransformerFusion}

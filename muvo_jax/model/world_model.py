@@ -1,0 +1,234 @@
+"""The world model: five pure functions over explicit variables, composed from the parts that the configuration names.
+
+    encode        observations -> embedding per frame
+    observe_step  state, previous action, embedding -> next state (filtering)
+    imagine_step  state, action -> next state (prediction)
+    decode        latent features -> images, range views, occupancy, actions
+    init          fresh variables
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from collections.abc import Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from flax import linen
+
+from muvo_jax.config import ModelConfig
+from muvo_jax.model import camera, common, fusion, heads, lidar, measurements, transition
+from muvo_jax.nn import init as init_lib
+from muvo_jax.nn import norm
+from muvo_jax.types import Batch, Gaussian, LatentState, Predictions, StepNoise, Variables
+
+ROUTE_MAP_SIZE = (64, 64)
+
+
+class Network(linen.Module):
+    """All parameters under one roof; WorldModel is the public face."""
+
+    config: ModelConfig
+
+    def setup(self):
+        config = self.config
+        self.camera = camera.REGISTRY[config.camera](config)
+        self.lidar = lidar.REGISTRY[config.lidar](config)
+        if config.route:
+            self.route = measurements.RouteEncoder(config)
+        if config.speed:
+            self.speed = measurements.SpeedEncoder(config)
+        self.fusion = fusion.REGISTRY[config.fusion](config)
+        self.transition = transition.REGISTRY[config.latent](config)
+        self.decoders = {name: head.build(config, head.channels) for name, head in heads.TABLE.items()
+                         if name in config.heads}
+
+    def encode(self, frames: dict[str, jax.Array], mode: norm.Mode, keys: jax.Array | None) -> jax.Array:
+        measured = []
+        if self.config.route:
+            measured.append(self.route(frames["route_map"], mode))
+        if self.config.speed:
+            measured.append(self.speed(frames["speed_mps"]))
+        return self.fusion(self.camera(frames["image"], mode), self.lidar(frames["range_view"], mode), measured, mode,
+                           keys)
+
+    def observe_step(self, *args):
+        return self.transition.observe_step(*args)
+
+    def imagine_step(self, *args):
+        return self.transition.imagine_step(*args)
+
+    def decode(self, features: jax.Array, names: tuple[str, ...]) -> Predictions:
+        return {name: self.decoders[name](features) for name in names}
+
+    def everything(self, frames: dict[str, jax.Array], noise: StepNoise, action: jax.Array, state: LatentState,
+                   is_first: jax.Array) -> Predictions:
+        """Touches every parameter once; only its shapes are ever computed."""
+        state, _ = self.observe_step(noise, action, state, self.encode(frames, norm.Mode(), None), is_first)
+        return self.decode(state.features, self.config.heads)
+
+
+@dataclasses.dataclass(frozen=True)
+class WorldModel:
+    """A frozen, hashable description of a model: pass it as a static argument under jit.
+
+    All methods are pure; `variables` is {"params": ..., "batch_stats": ...}, plain nested dictionaries.
+    """
+
+    config: ModelConfig
+
+    @property
+    def feature_channels(self) -> int:
+        """Channels of LatentState.features, what decoders and policies read."""
+        return common.feature_channels(self.config)
+
+    def variable_shapes(self) -> dict[str, Any]:
+        """The variables as jax.ShapeDtypeStruct leaves."""
+        # The plain convolutions trace fastest, and the parameters do not depend on the form.
+        network = Network(dataclasses.replace(self.config, convolution="xla", remat=False))
+        return dict(_variable_shapes(network))
+
+    def init(self, key: jax.Array, batch: Batch | None = None) -> dict[str, Any]:
+        """Fresh variables as float32 NumPy arrays; see muvo_jax.nn.init for the rules.
+
+        Args:
+          key: typed PRNG key; the same key gives the same numbers on every machine.
+          batch: where given, checked against the configuration (shapes do not depend on it otherwise).
+
+        Raises:
+          ValueError: if the batch does not fit the configuration.
+        """
+        if batch is not None:
+            self._frames(batch)
+        return init_lib.fill(self.variable_shapes(), key, heads.initial_constants(self.config))
+
+    def encode(self, variables: Variables, batch: Batch, *, train: bool = False, keys: jax.Array | None = None,
+               axis_name: str | None = None) -> tuple[jax.Array, Variables]:
+        """Embeds all frames jointly.
+
+        Args:
+          variables: of this model.
+          batch: B windows of T frames.
+          train: BatchNorm uses and updates the moments of this batch; dropout is on.
+          keys: typed keys [B], one per sample, needed when train; frame t of a sample uses fold_in(key, t).
+          axis_name: mapped axis over which the batch is split; BatchNorm is synchronised over it.
+
+        Returns:
+          embedding float32 [B, T, E] and the (updated) batch_stats.
+
+        Raises:
+          ValueError: if the batch lacks a modality or has other sizes than the configuration, or keys are missing.
+        """
+        frames = self._frames(batch)
+        mode = norm.Mode(train, axis_name)
+        frame_keys = None
+        if train and self.config.dropout > 0.0:
+            if keys is None or keys.shape != (batch.batch_size,):
+                raise ValueError(f"encode(train=True): got keys {None if keys is None else keys.shape}, expected one "
+                                 f"typed key per sample, shape ({batch.batch_size},), for the dropout masks.")
+            steps = jnp.arange(batch.frames)
+            frame_keys = jax.vmap(lambda key: jax.vmap(functools.partial(jax.random.fold_in, key))(steps))(keys)
+            frame_keys = frame_keys.reshape(-1)
+        network = Network(self.config)
+        if train:
+            embedding, updated = network.apply(variables, frames, mode, frame_keys, method="encode",
+                                               mutable=["batch_stats"])
+            batch_stats = updated["batch_stats"]
+        else:
+            embedding = network.apply(variables, frames, mode, None, method="encode")
+            batch_stats = variables["batch_stats"]
+        return embedding.reshape(batch.batch_size, batch.frames, -1), batch_stats
+
+    def initial_state(self, batch_size: int) -> LatentState:
+        """The zero state [batch_size, ...], before anything was seen."""
+        return transition.REGISTRY[self.config.latent].initial_state(self.config, batch_size)
+
+    def observe_step(self, variables: Variables, noise: StepNoise, action: jax.Array, state: LatentState,
+                     embedding: jax.Array, is_first: jax.Array) -> tuple[LatentState, tuple[Gaussian, Gaussian]]:
+        """Moves the state one step and corrects it by an observation.
+
+        Args:
+          variables: of this model.
+          noise: StepNoise [B, ...]; zeros give the mean mode.
+          action: [B, 2], the PREVIOUS action, applied between the last observation and this one.
+          state: LatentState [B, ...].
+          embedding: [B, E] of this observation.
+          is_first: bool [B]; where true, state and action are replaced by zeros and the RSSM dropout is off.
+
+        Returns:
+          the state to go on from, and (prior, posterior). Its sample is the posterior's, or the prior's where
+          noise.use_prior says so.
+        """
+        return Network(self.config).apply(variables, noise, action, state, embedding, is_first, method="observe_step")
+
+    def imagine_step(self, variables: Variables, noise: jax.Array, action: jax.Array,
+                     state: LatentState) -> tuple[LatentState, Gaussian]:
+        """Moves the state [B, ...] one step by action [B, 2] alone; noise is standard normal [B, S], zeros for the mean."""
+        return Network(self.config).apply(variables, noise, action, state, method="imagine_step")
+
+    def decode(self, variables: Variables, features: jax.Array, heads: Sequence[str] | None = None) -> Predictions:
+        """Decodes latent features [..., D + S] with any leading axes.
+
+        Args:
+          variables: of this model.
+          features: LatentState.features.
+          heads: which ones; None for all that the model has. Only these are computed.
+
+        Returns:
+          head -> scale -> float32 [..., *size / scale, channels]: image in [0, 1] where trained (no clipping),
+          range_view in metres, occupancy as logits [..., X, Y, Z, 2], action in (-1, 1) [..., 2] at scale 1.
+
+        Raises:
+          ValueError: for a head that the model does not have.
+        """
+        names = self.config.heads if heads is None else tuple(heads)
+        unknown = [name for name in names if name not in self.config.heads]
+        if unknown:
+            raise ValueError(f"decode: this model has no head {', '.join(unknown)}; it has {', '.join(self.config.heads)}.")
+        lead = features.shape[:-1]
+        flat = Network(self.config).apply(variables, features.reshape(-1, features.shape[-1]), names, method="decode")
+        return {name: {scale: _in_units(value, name, self.config).reshape(*lead, *value.shape[1:])
+                       for scale, value in scales.items()} for name, scales in flat.items()}
+
+    def _frames(self, batch: Batch) -> dict[str, Any]:
+        """The model's inputs with batch and time merged, [B * T, ...], after checking their sizes."""
+        config = self.config
+        expected = {"image": (*config.image_size, 3),
+                    "range_view": (config.range_view.rows, config.range_view.columns, 4)}
+        if config.route:
+            expected["route_map"] = ROUTE_MAP_SIZE
+        if config.speed:
+            expected["speed_mps"] = ()
+        frames = {}
+        for name, shape in expected.items():
+            value = getattr(batch, name)
+            if value is None:
+                raise ValueError(f"Batch.{name} is None, but the model reads it; switch it off in the configuration of "
+                                 f"the model or give it.")
+            if value.shape[2:] != shape:
+                raise ValueError(f"Batch.{name}: got {list(value.shape)}, expected [B, T, {', '.join(map(str, shape))}] "
+                                 f"as the model's configuration says.")
+            frames[name] = jnp.reshape(value, (-1, *shape))
+        return frames
+
+
+def _in_units(value: jax.Array, name: str, config: ModelConfig) -> jax.Array:
+    unit = heads.TABLE[name].unit(config)
+    return value if unit == 1.0 else value * unit
+
+
+@functools.lru_cache(maxsize=8)
+def _variable_shapes(network: Network) -> dict[str, Any]:
+    config = network.config
+    frames = {"image": jax.ShapeDtypeStruct((1, *config.image_size, 3), jnp.uint8),
+              "range_view": jax.ShapeDtypeStruct((1, config.range_view.rows, config.range_view.columns, 4), jnp.float32),
+              "route_map": jax.ShapeDtypeStruct((1, *ROUTE_MAP_SIZE), jnp.uint8),
+              "speed_mps": jax.ShapeDtypeStruct((1,), jnp.float32)}
+    state = jax.eval_shape(lambda: WorldModel(config).initial_state(1))
+    noise = StepNoise(state.stochastic, state.stochastic, jax.ShapeDtypeStruct((1,), jnp.bool_))
+    action = jax.ShapeDtypeStruct((1, 2), jnp.float32)
+    init = functools.partial(network.init, method="everything")
+    return jax.eval_shape(init, jax.random.key(0), frames, noise, action, state,
+                          jax.ShapeDtypeStruct((1,), jnp.bool_))

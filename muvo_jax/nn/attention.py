@@ -1,0 +1,116 @@
+"""Sine positions and the post-norm transformer encoder that fuses the sensors' tokens (paper section III-B).
+
+Dropout masks are drawn from one key per sample (row of the batch), so that they do not depend on how a batch is split
+over devices.
+"""
+
+from __future__ import annotations
+
+import math
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import linen
+
+from muvo_jax.nn import layers, norm
+
+_TEMPERATURE = 10_000.0
+
+
+def sine_positions(size: tuple[int, ...], channels: int) -> np.ndarray:
+    """float32 [prod(size), channels]: an equal share of the channels encodes each axis, sine and cosine interleaved.
+
+    Coordinate i of n is 2 pi (i + 1) / (n + 1e-6), as in DETR; cells are in row-major order.
+
+    Raises:
+      ValueError: if the channels cannot be shared evenly in pairs.
+    """
+    share, rest = divmod(channels, len(size))
+    if rest or share % 2:
+        raise ValueError(f"sine_positions: {channels} channels, expected a multiple of {2 * len(size)} for {len(size)} axes.")
+    frequencies = _TEMPERATURE ** (-2.0 * (np.arange(share) // 2) / share)
+    encoded = []
+    for axis, count in enumerate(size):
+        angle = 2 * math.pi * np.arange(1, count + 1) / (count + 1e-6)
+        phase = angle[:, None] * frequencies[None]
+        values = np.where(np.arange(share)[None] % 2 == 0, np.sin(phase), np.cos(phase))
+        shape = [1] * len(size) + [share]
+        shape[axis] = count
+        encoded.append(np.broadcast_to(values.reshape(shape), (*size, share)))
+    return np.concatenate(encoded, axis=-1).reshape(-1, channels).astype(np.float32)
+
+
+def dropout(x: jax.Array, keys: jax.Array | None, site: int, rate: float) -> jax.Array:
+    """Zeroes entries of x [N, ...] with probability `rate` and scales the rest by 1 / (1 - rate).
+
+    Args:
+      x: any float array.
+      keys: one typed key per row of x; None switches dropout off.
+      site: which dropout of the network this is; different sites draw different masks from the same keys.
+      rate: probability of zeroing.
+    """
+    if keys is None or rate == 0.0:
+        return x
+    keep = jax.vmap(lambda key: jax.random.bernoulli(jax.random.fold_in(key, site), 1.0 - rate, x.shape[1:]))(keys)
+    return jnp.where(keep, x / (1.0 - rate), jnp.zeros_like(x))
+
+
+class SelfAttention(linen.Module):
+    """Multi-head attention of tokens [N, L, C] on themselves; the softmax is computed in float32."""
+
+    heads: int
+    dropout_rate: float
+    compute: layers.Compute = layers.Compute()
+
+    @linen.compact
+    def __call__(self, x: jax.Array, keys: jax.Array | None, site: int) -> jax.Array:
+        count, length, channels = x.shape
+        head_channels = channels // self.heads
+        projected = layers.Dense(3 * channels, self.compute, name="in_proj")(x)
+        query, key, value = jnp.moveaxis(projected.reshape(count, length, 3, self.heads, head_channels), 2, 0)
+        scores = jnp.einsum("nqhc,nkhc->nhqk", query, key, preferred_element_type=jnp.float32)
+        weights = dropout(jax.nn.softmax(scores / math.sqrt(head_channels), axis=-1), keys, site, self.dropout_rate)
+        mixed = jnp.einsum("nhqk,nkhc->nqhc", weights.astype(value.dtype), value)
+        return layers.Dense(channels, self.compute, name="out_proj")(mixed.reshape(count, length, channels))
+
+
+class EncoderLayer(linen.Module):
+    """Post-norm layer: x = norm(x + attention(x)), x = norm(x + feed-forward(x)), ReLU inside."""
+
+    heads: int
+    hidden_channels: int
+    dropout_rate: float
+    compute: layers.Compute = layers.Compute()
+
+    @linen.compact
+    def __call__(self, x: jax.Array, keys: jax.Array | None, first_site: int) -> jax.Array:
+        drop = lambda value, offset: dropout(value, keys, first_site + offset, self.dropout_rate)
+        attended = SelfAttention(self.heads, self.dropout_rate, self.compute, name="self_attn")(x, keys, first_site)
+        x = norm.LayerNorm(name="norm1")(x + drop(attended, 1))
+        hidden = jax.nn.relu(layers.Dense(self.hidden_channels, self.compute, name="linear1")(x))
+        out = layers.Dense(x.shape[-1], self.compute, name="linear2")(drop(hidden, 2))
+        return norm.LayerNorm(name="norm2")(x + drop(out, 3))
+
+
+SITES_PER_LAYER = 4
+
+
+class TransformerEncoder(linen.Module):
+    """A stack of encoder layers over tokens [N, L, C], no mask and no final norm.
+
+    A plain loop: stacked parameters (scan) would turn biases into matrices, which weight decay tells apart.
+    """
+
+    layers_count: int
+    heads: int
+    hidden_channels: int
+    dropout_rate: float
+    compute: layers.Compute = layers.Compute()
+
+    @linen.compact
+    def __call__(self, x: jax.Array, keys: jax.Array | None = None) -> jax.Array:
+        for index in range(self.layers_count):
+            layer = EncoderLayer(self.heads, self.hidden_channels, self.dropout_rate, self.compute, name=f"layer{index}")
+            x = layer(x, keys, SITES_PER_LAYER * index)
+        return x

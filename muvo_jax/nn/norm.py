@@ -1,0 +1,103 @@
+"""Normalisation layers with float32 statistics: batch (synchronised over devices), layer, and adaptive instance norm.
+
+Differs from flax.linen.BatchNorm where torch does: momentum 0.1, eps 1e-5, the running variance is the unbiased one, and
+the variance is computed in two passes (no cancellation). Over an axis name, counts and sums are added up over the devices
+before any division, so that the statistics are those of the whole batch.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import jax
+import jax.numpy as jnp
+from flax import linen
+
+from muvo_jax.nn import layers
+
+
+@dataclasses.dataclass(frozen=True)
+class Mode:
+    """Where BatchNorm takes its moments from.
+
+    Attributes:
+      train: use the moments of this batch and update the running ones.
+      axis_name: mapped axis over which the batch is split, if any.
+    """
+
+    train: bool = False
+    axis_name: str | None = None
+
+
+class BatchNorm(linen.Module):
+    """[..., C] -> [..., C], normalised over all leading axes; running moments in the collection "batch_stats"."""
+
+    momentum: float = 0.1
+    epsilon: float = 1e-5
+
+    @linen.compact
+    def __call__(self, x: jax.Array, mode: Mode) -> jax.Array:
+        channels = x.shape[-1]
+        scale = self.param("scale", layers.shape_only, (channels,))
+        bias = self.param("bias", layers.shape_only, (channels,))
+        running_mean = self.variable("batch_stats", "mean", jnp.zeros, (channels,), jnp.float32)
+        running_var = self.variable("batch_stats", "var", jnp.ones, (channels,), jnp.float32)
+        x32 = x.astype(jnp.float32)
+        mean, var = running_mean.value, running_var.value
+        if mode.train:
+            mean, var, unbiased_var = batch_moments(x32, mode.axis_name)
+            if not self.is_initializing():
+                running_mean.value += self.momentum * (jax.lax.stop_gradient(mean) - running_mean.value)
+                running_var.value += self.momentum * (jax.lax.stop_gradient(unbiased_var) - running_var.value)
+        factor = scale * jax.lax.rsqrt(var + self.epsilon)
+        rank = x.ndim
+        y = (x32 - layers.per_channel(mean, rank)) * layers.per_channel(factor, rank) + layers.per_channel(bias, rank)
+        return y.astype(x.dtype)
+
+
+def batch_moments(x: jax.Array, axis_name: str | None) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Mean, biased and unbiased variance, each [C], of x [..., C] over all leading axes and over the mapped axis."""
+    total = lambda value: value if axis_name is None else jax.lax.psum(value, axis_name)
+    axes = tuple(range(x.ndim - 1))
+    count = total(jnp.float32(math.prod(x.shape[:-1])))
+    mean = total(jnp.sum(x, axes)) / count
+    squares = total(jnp.sum(jnp.square(x - layers.per_channel(mean, x.ndim)), axes))
+    return mean, squares / count, squares / jnp.maximum(count - 1.0, 1.0)
+
+
+class LayerNorm(linen.Module):
+    """[..., C] normalised over the last axis, eps 1e-5."""
+
+    epsilon: float = 1e-5
+
+    @linen.compact
+    def __call__(self, x: jax.Array) -> jax.Array:
+        scale = self.param("scale", layers.shape_only, (x.shape[-1],))
+        bias = self.param("bias", layers.shape_only, (x.shape[-1],))
+        x32 = x.astype(jnp.float32)
+        centred = x32 - jnp.mean(x32, axis=-1, keepdims=True)
+        y = centred * jax.lax.rsqrt(jnp.mean(jnp.square(centred), axis=-1, keepdims=True) + self.epsilon)
+        y = y * layers.per_channel(scale, x.ndim) + layers.per_channel(bias, x.ndim)
+        return y.astype(x.dtype)
+
+
+class AdaptiveInstanceNorm(linen.Module):
+    """Normalises x [N, *S, C] per sample and channel over space, then scales and shifts by affine maps of a style [N, F].
+
+    The scale is the map's output itself, not 1 plus it, as in the reference (StyleGAN).
+    """
+
+    compute: layers.Compute = layers.Compute()
+    epsilon: float = 1e-8
+
+    @linen.compact
+    def __call__(self, x: jax.Array, style: jax.Array) -> jax.Array:
+        affine = layers.Dense(2 * x.shape[-1], self.compute, name="style")(style).astype(jnp.float32)
+        scale, shift = jnp.split(affine, 2, axis=-1)
+        space = tuple(range(1, x.ndim - 1))
+        x32 = x.astype(jnp.float32)
+        centred = x32 - jnp.mean(x32, axis=space, keepdims=True)
+        inverse_std = jax.lax.rsqrt(jnp.mean(jnp.square(centred), axis=space, keepdims=True) + self.epsilon)
+        y = centred * (inverse_std * layers.spread(scale, x.ndim)) + layers.spread(shift, x.ndim)
+        return y.astype(x.dtype)

@@ -1,0 +1,37 @@
+"""Targets at the decoders' scales (paper section III-D): full size, half and quarter.
+
+Images are averaged over 2x2 pixels. Range views and occupancy are subsampled (index 2i), because the mean of a return and
+of a hole, or of a class and "unknown", means nothing. Each scale comes from the one before, as in the reference.
+"""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+
+from muvo_jax import types
+
+SCALES = (1, 2, 4)
+
+
+def image_labels(image: types.ArrayLike) -> dict[int, types.Array]:
+    """uint8 [..., H, W, 3] to {scale: float32 [..., H/scale, W/scale, 3]} in [0, 1]."""
+    labels = {1: jnp.asarray(image).astype(jnp.float32) / 255.0}
+    for scale in SCALES[1:]:
+        labels[scale] = _mean_2x2(labels[scale // 2])
+    return labels
+
+
+def range_view_labels(range_view: types.ArrayLike) -> dict[int, types.Array]:
+    """float32 [..., Hr, Wr, 4] in metres to {scale: float32 [..., Hr/scale, Wr/scale, 4]}, holes stay 0, 0, 0, -1."""
+    return {scale: jnp.asarray(range_view)[..., ::scale, ::scale, :] for scale in SCALES}
+
+
+def occupancy_labels(occupancy: types.ArrayLike) -> dict[int, types.Array]:
+    """uint8 [..., X, Y, Z] to {scale: uint8 [..., X/scale, Y/scale, Z/scale]}, unknown stays 255."""
+    return {scale: jnp.asarray(occupancy)[..., ::scale, ::scale, ::scale] for scale in SCALES}
+
+
+def _mean_2x2(image: types.Array) -> types.Array:
+    *leading, rows, columns, channels = image.shape
+    blocks = image.reshape(*leading, rows // 2, 2, columns // 2, 2, channels)
+    return blocks.mean(axis=(-4, -2))

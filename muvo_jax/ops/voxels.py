@@ -1,0 +1,162 @@
+"""Occupancy grids from points and from the rays that measured them (host side, NumPy).
+
+The paper voxelises fused depth-map and lidar points and calls every other voxel empty. Here a voxel is empty only where
+a measuring ray passed through it; voxels that no ray has reached are unknown.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from muvo_jax import config as config_lib
+from muvo_jax.ops import range_view
+
+EMPTY, OCCUPIED, UNKNOWN = 0, 1, 255
+
+
+def voxelize(points_m: np.ndarray, grid: config_lib.VoxelGrid) -> np.ndarray:
+    """Marks the voxels that contain a point.
+
+    Args:
+      points_m: [P, 3], ego frame, metres; points outside the grid count for nothing.
+
+    Returns:
+      uint8 [X, Y, Z], 1 where at least one point lies in [corner, corner + voxel size), else 0.
+
+    Raises:
+      ValueError: for another shape or for points that are not finite.
+    """
+    index, inside = voxel_index(points_m, grid)
+    occupied = np.zeros(grid.shape, np.uint8)
+    occupied[tuple(index[inside].T)] = 1
+    return occupied
+
+
+def voxel_index(points_m: np.ndarray, grid: config_lib.VoxelGrid) -> tuple[np.ndarray, np.ndarray]:
+    """Returns the voxel of each point, int32 [P, 3], and whether it lies inside the grid, bool [P]."""
+    index = np.floor(_in_voxels(points_m, grid)).astype(np.int32)
+    inside = ((index >= 0) & (index < np.asarray(grid.shape, np.int32))).all(axis=1)
+    return index, inside
+
+
+def carve(origin_m: np.ndarray, endpoints_m: np.ndarray, grid: config_lib.VoxelGrid) -> np.ndarray:
+    """Marks the voxels that a ray passed through before it ended.
+
+    The traversal is exact up to float32 rounding: between two neighbouring voxels a ray crosses one plane of the grid,
+    so the voxel behind each crossed plane of each axis, and the voxel of the origin, are all the voxels it visits.
+
+    Args:
+      origin_m: [3] or [P, 3], where the rays start, ego frame, metres; it may lie outside the grid.
+      endpoints_m: [P, 3], where they end.
+
+    Returns:
+      bool [X, Y, Z]. The voxel in which a ray ends is not marked by this ray (by another ray it may be).
+
+    Raises:
+      ValueError: for another shape or for points that are not finite.
+    """
+    ends = _in_voxels(endpoints_m, grid)
+    starts = _in_voxels(np.broadcast_to(np.asarray(origin_m, np.float32), ends.shape), grid)
+    end_voxel = _flat_index(np.floor(ends), grid)
+    starts, ends, reaches = _clip_to_grid(starts, ends, grid)
+    starts, ends, end_voxel = starts[reaches], ends[reaches], end_voxel[reaches]
+
+    passed = np.zeros(int(np.prod(grid.shape)), bool)
+    limit = np.asarray(grid.shape, np.float32) - 1
+    start_voxel = _flat_index(np.clip(np.floor(starts), 0, limit), grid)
+    passed[start_voxel[start_voxel != end_voxel]] = True
+    for axis in range(3):
+        passed[_entered_by_crossing(starts, ends, end_voxel, axis, grid)] = True
+    return passed.reshape(grid.shape)
+
+
+def occupancy_target(points_m: np.ndarray, ray_origins_m: np.ndarray, grid: config_lib.VoxelGrid, *,
+                     free_points_m: np.ndarray | None = None, free_origins_m: np.ndarray | None = None,
+                     ray_stride: int = 1) -> np.ndarray:
+    """Builds the training target of a frame: what the sensors hit is occupied, what they looked through is empty.
+
+    Args:
+      points_m: [P, 3], all measured points, ego frame, metres.
+      ray_origins_m: [3] or [P, 3], the sensor that measured each point.
+      free_points_m: [Q, 3], ends of rays that returned nothing up to there (sky, maximum range).
+      free_origins_m: [3] or [Q, 3]; by default `ray_origins_m`, which then must be one point.
+      ray_stride: every n-th ray carves; all points occupy.
+
+    Returns:
+      uint8 [X, Y, Z]: 1 occupied (wins over empty), 0 empty, 255 unknown.
+
+    Raises:
+      ValueError: for another shape or for points that are not finite.
+    """
+    occupied = voxelize(points_m, grid).astype(bool)
+    empty = carve(_strided(ray_origins_m, ray_stride), np.asarray(points_m)[::ray_stride], grid)
+    if free_points_m is not None and len(free_points_m):
+        origins = ray_origins_m if free_origins_m is None else free_origins_m
+        empty |= carve(_strided(origins, ray_stride), np.asarray(free_points_m)[::ray_stride], grid)
+    return np.where(occupied, np.uint8(OCCUPIED), np.where(empty, np.uint8(EMPTY), np.uint8(UNKNOWN)))
+
+
+def voxel_centres(grid: config_lib.VoxelGrid) -> np.ndarray:
+    """Returns the centres of all voxels, ego frame, metres, float32 [X, Y, Z, 3]."""
+    axes = [origin + grid.voxel_size_m * (np.arange(count) + 0.5)
+            for origin, count in zip(grid.origin_m, grid.shape, strict=True)]
+    return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).astype(np.float32)
+
+
+def _strided(origins_m: np.ndarray, stride: int) -> np.ndarray:
+    origins_m = np.asarray(origins_m, np.float32)
+    return origins_m if origins_m.ndim == 1 else origins_m[::stride]
+
+
+def _in_voxels(points_m: np.ndarray, grid: config_lib.VoxelGrid) -> np.ndarray:
+    """Coordinates in units of voxels from the lower corner of the grid."""
+    points_m = range_view.check_points(points_m)
+    return (points_m - np.asarray(grid.origin_m, np.float32)) * np.float32(1.0 / grid.voxel_size_m)
+
+
+def _flat_index(index: np.ndarray, grid: config_lib.VoxelGrid) -> np.ndarray:
+    """Row-major voxel number of integral [P, 3] indices, int32, -1 outside the grid."""
+    inside = ((index >= 0) & (index < np.asarray(grid.shape, np.float32))).all(axis=1)
+    number = (index[:, 0] * grid.shape[1] + index[:, 1]) * grid.shape[2] + index[:, 2]
+    return np.where(inside, number, -1).astype(np.int32)
+
+
+def _clip_to_grid(starts: np.ndarray, ends: np.ndarray,
+                  grid: config_lib.VoxelGrid) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Cuts segments (in voxels) to the box of the grid; the third result says which segments touch it at all."""
+    size = np.asarray(grid.shape, np.float32)
+    direction = ends - starts
+    safe = np.where(direction == 0, np.float32(1e-20), direction)
+    with np.errstate(over="ignore"):
+        at_low, at_high = -starts / safe, (size - starts) / safe
+    enter = np.maximum(np.minimum(at_low, at_high).max(axis=1), 0)[:, None]
+    leave = np.minimum(np.maximum(at_low, at_high).min(axis=1), 1)[:, None]
+    clipped_starts = np.where(enter > 0, starts + direction * enter, starts)
+    clipped_ends = np.where(leave < 1, starts + direction * leave, ends)
+    return clipped_starts, clipped_ends, (enter < leave)[:, 0]
+
+
+def _entered_by_crossing(starts: np.ndarray, ends: np.ndarray, end_voxel: np.ndarray, axis: int,
+                         grid: config_lib.VoxelGrid) -> np.ndarray:
+    """Numbers of the voxels that rays enter through grid planes perpendicular to `axis`, end voxels left out."""
+    strides = (grid.shape[1] * grid.shape[2], grid.shape[2], 1)
+    first, last = (np.clip(np.floor(side[:, axis]), 0, grid.shape[axis] - 1).astype(np.int32)
+                   for side in (starts, ends))
+    crosses = first != last
+    starts, ends, first, last = starts[crosses], ends[crosses], first[crosses], last[crosses]
+    moving = ends[:, axis] - starts[:, axis]
+    sign = np.sign(last - first).astype(np.int32)
+    count = np.abs(last - first)
+    step = np.arange(count.sum(), dtype=np.int32) - np.repeat(np.cumsum(count, dtype=np.int32) - count, count)
+    # The plane between voxels k and k+1 lies at k+1; what follows is anchored at the first plane each ray crosses.
+    to_plane = (first + (sign > 0)).astype(np.float32) - starts[:, axis]
+    step_float, sign_float = step.astype(np.float32), sign.astype(np.float32)
+    number = (np.repeat(first + sign, count) + np.repeat(sign, count) * step) * np.int32(strides[axis])
+    for other in range(3):
+        if other == axis:
+            continue
+        slope = (ends[:, other] - starts[:, other]) / moving
+        anchor = starts[:, other] + to_plane * slope
+        index = (np.repeat(anchor, count) + np.repeat(sign_float * slope, count) * step_float).astype(np.int32)
+        number += np.clip(index, 0, grid.shape[other] - 1) * np.int32(strides[other])
+    return number[number != np.repeat(end_voxel[crosses], count)]

@@ -1,0 +1,369 @@
+"""Checkpoints: Orbax, wrapped once, with proof that what is on disk can be read.
+
+A checkpoint is one folder per step with three items, `variables` (all that inference needs), `training` (optimizer
+state, run key, step) and `meta` (config, action contract, package versions, where the data came from, position in the
+data), and a list of the SHA-256 of every file, written last. A folder without that list, or with a file that differs
+from it, was interrupted or damaged; `restore_latest` then takes the one before and says so.
+"""
+
+from __future__ import annotations
+
+import base64
+import dataclasses
+import hashlib
+import importlib.metadata
+import json
+import logging
+import os
+import pathlib
+import shutil
+from collections.abc import Mapping
+from typing import Any
+
+import jax
+import orbax.checkpoint as ocp
+
+from muvo_jax import config as config_lib
+from muvo_jax import types
+from muvo_jax.model import world_model
+
+SCHEMA_VERSION = 1
+CHECKSUM_FILE = "checksums.json"
+FOLDER = "checkpoints"
+DAMAGED_FOLDER = "damaged_checkpoints"
+_PACKAGES = ("muvo_jax", "jax", "jaxlib", "flax", "optax", "orbax-checkpoint", "numpy")
+_preservation = ocp.checkpoint_managers
+
+
+class CheckpointError(OSError):
+    """A checkpoint could not be written or read; the message names it and what to do."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Restored:
+    """A restored training state.
+
+    Attributes:
+      state: like the one that was asked for.
+      step: updates done.
+      data_state: position in the data, as it was given to `save`; None where none was.
+      meta: everything else that was stored.
+      warnings: what was passed over on the way, for the user to read.
+    """
+
+    state: Any
+    step: int
+    data_state: Any
+    meta: Mapping[str, Any]
+    warnings: tuple[str, ...]
+
+
+@dataclasses.dataclass(frozen=True)
+class LoadedRun:
+    """A trained model and where it came from.
+
+    Attributes:
+      config: the whole configuration of the run.
+      model: its world model.
+      variables: {"params", "batch_stats"} on the first device.
+      step: updates done.
+      folder: the run's folder.
+      provenance: what the model was trained on.
+      warnings: damaged checkpoints that were passed over.
+    """
+
+    config: config_lib.Config
+    model: world_model.WorldModel
+    variables: types.Variables
+    step: int
+    folder: pathlib.Path
+    provenance: Mapping[str, Any]
+    warnings: tuple[str, ...]
+
+
+class Checkpoints:
+    """The checkpoints of one run: RUN/checkpoints/STEP."""
+
+    def __init__(self, run_folder: str | os.PathLike, *, keep_last: int = 2, keep_best: int = 1):
+        """Keeps the `keep_last` newest (at least two: a damaged one needs a predecessor) and the best by score."""
+        logging.getLogger("absl").setLevel(logging.ERROR)
+        self.run_folder = pathlib.Path(run_folder).resolve()
+        self.folder = self.run_folder / FOLDER
+        self._policy = _preservation.AnyPreservationPolicy([
+            _preservation.LatestN(max(2, keep_last)),
+            _preservation.BestN(get_metric_fn=lambda metrics: metrics["score"], n=keep_best,
+                                keep_checkpoints_without_metrics=False)])
+        self._manager = self._open()
+
+    def _open(self) -> ocp.CheckpointManager:
+        options = ocp.CheckpointManagerOptions(preservation_policy=self._policy, enable_async_checkpointing=False,
+                                               create=True, cleanup_tmp_directories=True)
+        return ocp.CheckpointManager(self.folder, options=options, item_names=("variables", "training", "meta"))
+
+    def steps(self) -> list[int]:
+        """Steps that have a folder, oldest first, whether readable or not."""
+        return _steps(self.folder)
+
+    def save(self, step: int, state, *, config: config_lib.Config, data_state=None, score: float | None = None,
+             provenance: Mapping[str, Any] | None = None) -> pathlib.Path:
+        """Writes one checkpoint; it counts as readable only once its checksums are there.
+
+        Args:
+          step: updates done.
+          state: a TrainState.
+          config: of the run.
+          data_state: position in the data (JSON types or bytes).
+          score: the higher the better; keeps the best. None: never kept for being best.
+          provenance: what the data is.
+
+        Raises:
+          CheckpointError: where writing failed (disk full); earlier checkpoints stay untouched.
+        """
+        meta = {"schema_version": SCHEMA_VERSION, "step": step, "variant": config.model.variant,
+                "config": config.to_dict(), "contract": dataclasses.asdict(config.contract),
+                "packages": package_versions(), "provenance": dict(provenance or {}),
+                "data_state": _encode(data_state), "score": score}
+        items = ocp.args.Composite(
+            variables=ocp.args.StandardSave({"params": state.params, "batch_stats": state.batch_stats}),
+            training=ocp.args.StandardSave({"opt_state": state.opt_state, "key": state.key, "step": state.step}),
+            meta=ocp.args.JsonSave(meta))
+        folder = self.folder / str(step)
+        try:
+            if folder.exists():  # an interrupted or damaged save of the same step
+                set_aside(self.run_folder, [step])
+                self._manager.reload()
+            self._manager.save(step, args=items, metrics=None if score is None else {"score": score}, force=True)
+            self._manager.wait_until_finished()
+            _write_checksums(folder)
+        except Exception as error:  # Orbax and TensorStore raise OSError, ValueError or RuntimeError for a full disk
+            shutil.rmtree(folder, ignore_errors=True)
+            self._discard_partial_saves()
+            kept = [str(other) for other in self.steps() if damage(self.folder / str(other)) is None]
+            raise CheckpointError(
+                f"checkpoint of step {step} could not be written to {self.folder}: {_first_line(error)}. "
+                f"Is the disk full? Readable checkpoints: {', '.join(kept) or 'none'}. Free some space and go on "
+                f"with --resume.") from error
+        return folder
+
+    def _discard_partial_saves(self) -> None:
+        for path in self.folder.glob("*orbax-checkpoint-tmp*"):
+            shutil.rmtree(path, ignore_errors=True)
+        self._manager = self._open()
+
+    def restore_latest(self, like, config: config_lib.Config) -> Restored | None:
+        """Restores the newest readable checkpoint onto the devices of `like`, whatever devices wrote it.
+
+        Args:
+          like: a TrainState of the right structure, shapes and placement.
+          config: of the run that goes on; its model must be the stored one.
+
+        Returns:
+          None where there is no checkpoint at all.
+
+        Raises:
+          CheckpointError: where there are checkpoints but none can be read.
+          ValueError: where they belong to another architecture; names both.
+        """
+        warnings: list[str] = []
+        abstract = jax.tree.map(_abstract, like)
+        for step in reversed(self.steps()):
+            reason = damage(self.folder / str(step))
+            if reason is None:
+                meta = read_meta(self.folder / str(step))
+                check_architecture(config, config_lib.Config.from_dict(meta["config"]), str(self.folder / str(step)))
+                try:
+                    state = self._restore(step, abstract, like)
+                except Exception as error:  # whatever Orbax raises: the checkpoint before may still be good
+                    reason = f"it cannot be restored ({_first_line(error)})"
+                else:
+                    return Restored(state, step, _decode(meta["data_state"]), meta, tuple(warnings))
+            warnings.append(f"checkpoint {self.folder / str(step)} is damaged: {reason}; trying the one before.")
+        if warnings:
+            raise CheckpointError(f"no readable checkpoint in {self.folder}: " + " ".join(warnings))
+        return None
+
+    def _restore(self, step: int, abstract, like):
+        items = ocp.args.Composite(
+            variables=ocp.args.StandardRestore({"params": abstract.params, "batch_stats": abstract.batch_stats}),
+            training=ocp.args.StandardRestore({"opt_state": abstract.opt_state, "key": abstract.key,
+                                               "step": abstract.step}))
+        restored = self._manager.restore(step, args=items)
+        return like.replace(**restored.variables, **restored.training)
+
+    def reload(self) -> None:
+        """Looks at the folder again, after something was moved out of it."""
+        self._manager.reload()
+
+    def close(self) -> None:
+        self._manager.close()
+
+
+def load_run(run: str | os.PathLike, which: int | str = "latest") -> LoadedRun:
+    """Loads a trained model for inference onto the first device, wherever it was trained.
+
+    Args:
+      run: a run's folder.
+      which: "latest", "best" (highest validation score) or a step.
+
+    Raises:
+      CheckpointError: where there is no run, no such checkpoint, or none that can be read.
+      ValueError: where it was written by a version with an unknown schema or configuration.
+    """
+    folder = pathlib.Path(run).resolve()
+    checkpoints = folder / FOLDER
+    found = _steps(checkpoints)
+    if not found:
+        state = "has no checkpoint yet" if folder.is_dir() else "does not exist"
+        raise CheckpointError(f"{folder} {state}; expected {checkpoints}/STEP. Train first: python -m muvo_jax.train.")
+    candidates = _candidates(checkpoints, found, which)
+    warnings = []
+    for step in candidates:
+        path = checkpoints / str(step)
+        reason = damage(path)
+        if reason is None:
+            meta = read_meta(path)
+            config = config_lib.Config.from_dict(meta["config"])
+            variables = _restore_variables(path / "variables")
+            return LoadedRun(config, world_model.WorldModel(config.model), variables, step, folder, meta["provenance"],
+                             tuple(warnings))
+        warnings.append(f"checkpoint {path} is damaged: {reason}; trying the one before.")
+    raise CheckpointError(f"no readable checkpoint in {checkpoints}: " + " ".join(warnings))
+
+
+def load(run: str | os.PathLike) -> tuple[world_model.WorldModel, types.Variables]:
+    """Returns (model, variables) of the newest readable checkpoint of a run; see `load_run` for more and for errors."""
+    loaded = load_run(run)
+    return loaded.model, loaded.variables
+
+
+def check_architecture(wanted: config_lib.Config, stored: config_lib.Config, where: str) -> None:
+    """Raises ValueError naming both where the two configs describe different networks."""
+    if wanted.model == stored.model:
+        return
+    ours, theirs = dataclasses.asdict(wanted.model), dataclasses.asdict(stored.model)
+    fields = [f"{name} {theirs[name]!r} (checkpoint) against {ours[name]!r} (asked for)"
+              for name in ours if ours[name] != theirs[name]]
+    raise ValueError(f"{where} holds another architecture: it is {stored.model.variant} of preset {stored.preset!r}, "
+                     f"asked for is {wanted.model.variant} of preset {wanted.preset!r}. Different: "
+                     f"{'; '.join(fields)}. Use the run's own settings, or a new --name.")
+
+
+def damage(folder: pathlib.Path) -> str | None:
+    """Why a checkpoint folder cannot be trusted, or None where every file is as it was written."""
+    try:
+        listed = json.loads((folder / CHECKSUM_FILE).read_text(encoding="utf-8"))["files"]
+    except FileNotFoundError:
+        return f"it has no {CHECKSUM_FILE}, so saving was interrupted"
+    except (OSError, ValueError, KeyError, TypeError):
+        return f"its {CHECKSUM_FILE} cannot be read"
+    for name, expected in listed.items():
+        path = folder / name
+        if not path.is_file():
+            return f"{name} is missing"
+        if _sha256(path) != expected:
+            return f"{name} has changed since it was written ({path.stat().st_size} bytes now)"
+    return None
+
+
+def set_aside(run_folder: str | os.PathLike, steps: list[int]) -> list[pathlib.Path]:
+    """Moves checkpoints out of the way (RUN/damaged_checkpoints), so that training can write these steps again."""
+    run_folder = pathlib.Path(run_folder)
+    moved = []
+    for step in steps:
+        target = run_folder / DAMAGED_FOLDER / str(step)
+        copy = 1
+        while target.exists():
+            copy += 1
+            target = target.with_name(f"{step}-{copy}")
+        target.parent.mkdir(exist_ok=True)
+        (run_folder / FOLDER / str(step)).rename(target)
+        moved.append(target)
+    return moved
+
+
+def read_meta(folder: pathlib.Path) -> dict[str, Any]:
+    """The stored description of a checkpoint.
+
+    Raises:
+      ValueError: for an unknown schema version.
+    """
+    with ocp.Checkpointer(ocp.JsonCheckpointHandler()) as reader:
+        meta = reader.restore(folder / "meta")
+    if meta["schema_version"] != SCHEMA_VERSION:
+        raise ValueError(f"{folder} has checkpoint schema {meta['schema_version']}, this version reads "
+                         f"{SCHEMA_VERSION}. It was written by muvo_jax {meta['packages'].get('muvo_jax')}: use that.")
+    return meta
+
+
+def package_versions() -> dict[str, str | None]:
+    """Versions of the packages that a run depends on; None where a package is not installed as one."""
+    def version(name):
+        try:
+            return importlib.metadata.version(name)
+        except importlib.metadata.PackageNotFoundError:
+            return None
+    return {name: version(name) for name in _PACKAGES}
+
+
+def _candidates(checkpoints: pathlib.Path, found: list[int], which: int | str) -> list[int]:
+    newest_first = found[::-1]
+    if which == "latest":
+        return newest_first
+    if which == "best":
+        scores = {step: read_meta(checkpoints / str(step))["score"] for step in newest_first
+                  if damage(checkpoints / str(step)) is None}
+        scored = {step: score for step, score in scores.items() if score is not None}
+        return [max(scored, key=scored.get)] if scored else newest_first  # type: ignore[arg-type]
+    if which not in found:
+        raise CheckpointError(f"{checkpoints} has no step {which}; it has {', '.join(map(str, found))}.")
+    return [int(which)]
+
+
+def _restore_variables(folder: pathlib.Path) -> types.Variables:
+    with ocp.StandardCheckpointer() as reader:
+        target = jax.tree.map(_on_first_device, reader.metadata(folder).item_metadata.tree)
+        return reader.restore(folder, target)
+
+
+def _on_first_device(leaf) -> jax.ShapeDtypeStruct:
+    sharding = jax.sharding.SingleDeviceSharding(jax.devices()[0])
+    return jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=sharding)
+
+
+def _abstract(leaf):
+    sharding = getattr(leaf, "sharding", None) or jax.sharding.SingleDeviceSharding(jax.devices()[0])
+    return jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=sharding)
+
+
+def _steps(folder: pathlib.Path) -> list[int]:
+    return sorted(int(path.name) for path in folder.iterdir() if path.is_dir() and path.name.isdigit()) \
+        if folder.is_dir() else []
+
+
+def _write_checksums(folder: pathlib.Path) -> None:
+    files = {str(path.relative_to(folder)): _sha256(path) for path in sorted(folder.rglob("*")) if path.is_file()}
+    partial = folder / (CHECKSUM_FILE + ".part")
+    with partial.open("w", encoding="utf-8") as file:
+        json.dump({"schema_version": SCHEMA_VERSION, "files": files}, file, indent=1)
+        file.flush()
+        os.fsync(file.fileno())
+    partial.replace(folder / CHECKSUM_FILE)
+
+
+def _sha256(path: pathlib.Path) -> str:
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def _encode(data_state):
+    return {"base64": base64.b64encode(data_state).decode()} if isinstance(data_state, bytes) else data_state
+
+
+def _decode(stored):
+    is_bytes = isinstance(stored, dict) and set(stored) == {"base64"}
+    return base64.b64decode(stored["base64"]) if is_bytes else stored
+
+
+def _first_line(error: BaseException) -> str:
+    lines = str(error).strip().splitlines() or [""]
+    return f"{type(error).__name__}: {lines[0][:300]}"

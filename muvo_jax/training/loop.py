@@ -1,0 +1,353 @@
+"""The training loop: data in, checkpoints, numbers and pictures out, resumable at every step.
+
+A run is exact: step n always sees the same windows and the same randomness, whether the run was interrupted or not.
+"""
+
+from __future__ import annotations
+
+import concurrent.futures
+import dataclasses
+import math
+import pathlib
+import resource
+import signal
+import sys
+import threading
+import time
+from collections.abc import Callable, Collection, Iterator, Mapping
+
+import jax
+
+from muvo_jax import config as config_lib
+from muvo_jax import types
+from muvo_jax.data import pipeline, prepare, schema
+from muvo_jax.training import checkpoint, preparation, run_folder, screen, validation
+
+Preview = Callable[[pathlib.Path, validation.Validator, types.Variables, str], None]
+
+
+class NonFiniteLossError(ArithmeticError):
+    """The loss is NaN or infinite; the message names the step, the terms and the last good checkpoint."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Job:
+    """What to train and where.
+
+    Attributes:
+      config: a preset with the user's changes.
+      folder: the run's folder.
+      open_recording: opens (or first makes) the data; called once.
+      chosen: dotted names that the user set, which fitting the config to the data leaves alone.
+      resume: go on with the run in `folder` instead of starting one.
+      resume_command: what to type to go on, for messages.
+      started_s: time.perf_counter() at the start of the command.
+      preview: draws pictures at `train.preview_every`.
+    """
+
+    config: config_lib.Config
+    folder: pathlib.Path
+    open_recording: Callable[[], schema.Recording]
+    chosen: Collection[str] = ()
+    resume: bool = False
+    resume_command: str = "python -m muvo_jax.train --resume"
+    started_s: float = dataclasses.field(default_factory=time.perf_counter)
+    preview: Preview | None = None
+
+
+@dataclasses.dataclass(frozen=True)
+class Outcome:
+    """How a run ended: its config as fitted to the data, the step reached, and whether it was stopped before the end."""
+
+    config: config_lib.Config
+    step: int
+    stopped: bool
+
+
+def train(job: Job, show: screen.Screen) -> Outcome:
+    """Trains to `train.steps`, or until the user stops it.
+
+    Raises:
+      FileExistsError: where the run exists and `resume` is not asked for.
+      DataError, ValueError: for data or settings that do not fit.
+      CheckpointError: where a checkpoint cannot be written, or none can be read.
+      NonFiniteLossError: where the loss is not finite.
+    """
+    if not job.resume:
+        run_folder.check_new(job.folder, job.resume_command)
+    with concurrent.futures.ThreadPoolExecutor(1, "preparation") as background:
+        early = background.submit(_prepare_early, job.config)
+        config, recording, making_s = _open_data(job, show)
+        frames = pipeline.Frames(recording, config)
+        source = pipeline.train_batches(frames, seed=config.train.seed, batch=windows_per_step(config))
+        shapes = preparation.expected_batch(config, windows_per_step(config),
+                                            rewards="reward" in recording.description.modalities)
+        ready = early.result()
+        ready = preparation.recompile(ready, config, shapes) if ready else preparation.prepare(config, shapes)
+    _introduce(job, show, config, ready, source.windows_per_epoch)
+    if not job.resume:
+        run_folder.create(job.folder, config, job.resume_command)
+    keeper = checkpoint.Checkpoints(job.folder, keep_last=config.train.keep_last, keep_best=config.train.keep_best)
+    state, done, data_state = _resume(job, show, keeper, config, ready) if job.resume else (ready.state, 0, None)
+    if data_state is not None:
+        source = pipeline.train_batches(frames, seed=config.train.seed, batch=windows_per_step(config),
+                                        start_state=data_state)
+    run_folder.write_config(job.folder, config)
+    files = run_folder.RunFolder(job.folder, done)
+    validator = validation.Validator(ready.model, config, frames)
+    try:
+        run = _Run(job, show, config, ready, keeper, files, validator, state, done, provenance(recording, config))
+        return run.loop(source, making_s)
+    finally:
+        show.stop()
+        files.close()
+        keeper.close()
+
+
+def windows_per_step(config: config_lib.Config) -> int:
+    """Windows that one update sees, over all micro-batches and devices."""
+    return config.train.batch * config.optimizer.accumulate
+
+
+def provenance(recording: schema.Recording, config: config_lib.Config) -> dict:
+    """What a checkpoint remembers of its data."""
+    description = recording.description
+    frames = {split: sum(sequence.length for sequence in recording.sequences if sequence.split == split)
+              for split in description.splits}
+    return {"name": description.name, "kind": description.kind, "path": config.data.path, "frames": frames,
+            "rate_hz": description.rate_hz, "notes": list(description.notes)}
+
+
+def _prepare_early(config: config_lib.Config) -> preparation.Prepared | None:
+    """Compiles while the town is recorded: its sensors are the preset's. Other data must be looked at first."""
+    if config.data.path != "town":
+        return None
+    return preparation.prepare(config, preparation.expected_batch(config, windows_per_step(config)))
+
+
+def _open_data(job: Job, show: screen.Screen) -> tuple[config_lib.Config, schema.Recording, float]:
+    start_s = time.perf_counter()
+    recording = job.open_recording()
+    adapted = prepare.adapt(job.config, recording, keep=job.chosen)
+    description = recording.description
+    counts = provenance(recording, adapted.config)["frames"]
+    show.field("data", f"{description.name} ({description.kind}, {description.rate_hz:g} Hz), frames: "
+                       + ", ".join(f"{split} {count}" for split, count in counts.items()))
+    for note in (*description.notes, *adapted.notes):
+        show.field("", note)
+    return adapted.config, recording, time.perf_counter() - start_s
+
+
+def _introduce(job: Job, show: screen.Screen, config: config_lib.Config, ready: preparation.Prepared,
+               windows: int) -> None:
+    data, accumulate = config.data, config.optimizer.accumulate
+    frame_s = data.stride / config.contract.rate_hz
+    show.field("windows", f"{windows} of {data.frames} frames, {frame_s:g} s apart; then {data.context} observed and "
+                          f"{data.horizon} imagined in evaluation")
+    show.field("model", f"{config.model.variant} ({config.model.latent}), {ready.parameters:,} parameters, heads "
+                        f"{', '.join(config.model.heads)}")
+    extra = f" x {accumulate} accumulated" if accumulate > 1 else ""
+    show.field("steps", f"{config.train.steps} of {config.train.batch} windows{extra}, {ready.step.plan.describe()}")
+    show.field("run", str(job.folder))
+
+
+def _resume(job: Job, show: screen.Screen, keeper: checkpoint.Checkpoints, config: config_lib.Config,
+            ready: preparation.Prepared):
+    restored = keeper.restore_latest(ready.state, config)
+    if restored is None:
+        show.warn(f"{job.folder} has no checkpoint yet: training starts at step 0.")
+        run_folder.forget_after(job.folder, 0)
+        return ready.state, 0, None
+    for text in restored.warnings:
+        show.warn(text)
+    later = [step for step in keeper.steps() if step > restored.step]
+    for path in checkpoint.set_aside(job.folder, later):
+        show.warn(f"moved the damaged checkpoint to {path}.")
+    keeper.reload()
+    run_folder.forget_after(job.folder, restored.step)
+    show.field("resumed", f"from step {restored.step}")
+    return restored.state, restored.step, restored.data_state
+
+
+class _Run:
+    """One run in progress."""
+
+    def __init__(self, job: Job, show: screen.Screen, config: config_lib.Config, ready: preparation.Prepared,
+                 keeper: checkpoint.Checkpoints, files: run_folder.RunFolder, validator: validation.Validator,
+                 state, done: int, origin: Mapping):
+        self.job, self.show, self.config, self.ready = job, show, config, ready
+        self.keeper, self.files, self.validator, self.origin = keeper, files, validator, origin
+        self.state, self.done, self.saved = state, done, done if keeper.steps() else None
+        self.step_times_s: list[float] = []
+
+    def loop(self, source: pipeline.TrainBatches, making_s: float) -> Outcome:
+        settings, pace = self.config.train, screen.Pace()
+        feed = pipeline.prefetch_to_device(_Placed(source, self.ready.step.place))
+        unchecked: tuple[int, Mapping] | None = None
+        with feed, _StopRequest() as stop:
+            self.show.start(settings.steps, self.done)
+            while self.done < settings.steps and not stop.requested:
+                start_s, waited_s = time.perf_counter(), feed.waited_s
+                batch = next(feed)
+                self.state, metrics = self.ready.step(self.state, batch)
+                first = not self.step_times_s
+                self.done += 1
+                if unchecked:  # one step late, so that the device does not wait for the host
+                    self._check(*unchecked)
+                unchecked = (self.done, metrics)
+                due = _due(self.done, settings)
+                if first or due.log or due.any_pause or self.done == settings.steps:
+                    self._check(self.done, metrics)
+                    unchecked = None
+                self.step_times_s.append(time.perf_counter() - start_s)
+                pace.step(feed.waited_s - waited_s)
+                if first:
+                    self._first_loss(float(metrics["total"]), making_s)
+                    pace.restart()
+                elif due.log:
+                    self._log(metrics, pace.mark(settings.steps - self.done))
+                if due.any_pause and self.done < settings.steps:
+                    self._pause(due, feed.get_state())
+                    pace.restart()
+            if unchecked:
+                self._check(*unchecked)
+            self._finish(stop.requested, feed.get_state())
+        return Outcome(self.config, self.done, stop.requested and self.done < settings.steps)
+
+    def _check(self, step: int, metrics: Mapping) -> None:
+        if float(metrics["finite"]) == 1.0:
+            return
+        values = {name: float(value) for name, value in metrics.items()}
+        bad = [f"{name} = {value}" for name, value in values.items() if not math.isfinite(value)]
+        self.files.log({"kind": "non_finite", "step": step, **values})
+        raise NonFiniteLossError(
+            f"step {step}: the loss is not finite: {', '.join(bad)}. "
+            + (f"The last good checkpoint is of step {self.saved}, in {self.keeper.folder / str(self.saved)}."
+               if self.saved is not None else "There is no checkpoint yet.")
+            + " Try a lower --learning-rate, or gradient clipping: --set optimizer.clip_norm=1.")
+
+    def _first_loss(self, loss: float, making_s: float) -> None:
+        ready = self.ready
+        self.show.line(f"first loss {loss:.4f} after {time.perf_counter() - self.job.started_s:.1f} s (data "
+                       f"{making_s:.1f} s, initialisation {ready.initialisation_s:.1f} s, compilation "
+                       f"{ready.compilation_s:.1f} s, first step {self.step_times_s[0]:.1f} s; data and compilation "
+                       f"overlap where they can)")
+
+    def _log(self, metrics: Mapping, figures: Mapping[str, float]) -> None:
+        numbers = {name: float(value) for name, value in metrics.items() if name != "finite"}
+        pace = {name: round(value, 4) for name, value in figures.items() if name != "left_s"}
+        self.files.log({"kind": "train", "step": self.done, **numbers, **pace})
+        text = screen.figures_text({**numbers, **figures})
+        self.show.advance(self.done, text)
+        left = screen.duration_text(figures["left_s"])
+        self.show.log(f"step {self.done}/{self.config.train.steps}  {text}  ETA {left}")
+
+    def _pause(self, due: _Due, data_state) -> None:
+        """Validation, pictures and a checkpoint, as far as they are due."""
+        score = self._validate() if due.validate else None
+        if due.preview:
+            self._preview()
+        if due.checkpoint:
+            self._save(data_state, score)
+
+    def _validate(self) -> float | None:
+        """Returns the score of the first validation split, the higher the better."""
+        scores = []
+        for split in self.validator.splits:
+            numbers = self.validator.run(self.state, split)
+            self.files.log({"kind": "validation", "split": split, "step": self.done, **numbers})
+            self.show.line(f"step {self.done}  {split}: {validation.text(numbers)}")
+            scores.append(-numbers["total"])
+        return scores[0] if scores and math.isfinite(scores[0]) else None
+
+    def _preview(self) -> None:
+        if self.job.preview is not None:
+            name = f"step_{self.done:06d}"
+            self.job.preview(self.job.folder / run_folder.PREVIEW_FOLDER, self.validator, self.state.variables, name)
+
+    def _save(self, data_state, score: float | None = None) -> None:
+        self.keeper.save(self.done, self.state, config=self.config, data_state=data_state, score=score,
+                         provenance=self.origin)
+        self.saved = self.done
+
+    def _finish(self, stopped: bool, data_state) -> None:
+        total = self.config.train.steps
+        self.show.stop()
+        if self.done >= total and self.step_times_s:
+            score = self._validate()
+            self._preview()
+            self._save(data_state, score)
+        elif self.step_times_s and self.saved != self.done:
+            self._save(data_state)
+        if stopped and self.done < total:
+            self.show.line(f"stopped at step {self.done} of {total}; saved. Go on with:  {self.job.resume_command}")
+        steady_s = sorted(self.step_times_s[1:])
+        if steady_s:
+            self.show.line(f"{len(self.step_times_s)} steps, median {steady_s[len(steady_s) // 2]:.3f} s each; peak memory "
+                           f"{peak_memory_gib():.2f} GiB; {screen.duration_text(time.perf_counter() - self.job.started_s)} "
+                           f"since the start")
+        elif not self.step_times_s:
+            self.show.line(f"nothing left to train: step {self.done} of {total} is reached (more with --steps).")
+
+
+@dataclasses.dataclass(frozen=True)
+class _Due:
+    log: bool
+    validate: bool
+    checkpoint: bool
+    preview: bool
+
+    @property
+    def any_pause(self) -> bool:
+        return self.validate or self.checkpoint or self.preview
+
+
+def _due(step: int, settings: config_lib.TrainConfig) -> _Due:
+    def every(period):
+        return period > 0 and step % period == 0
+    return _Due(every(settings.log_every), every(settings.validate_every), every(settings.checkpoint_every),
+                every(settings.preview_every))
+
+
+def peak_memory_gib() -> float:
+    """The most memory this process has held so far."""
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak / 2**30 if sys.platform == "darwin" else peak / 2**20
+
+
+class _Placed:
+    """Batches split and uploaded for the training step; knows its source's position."""
+
+    def __init__(self, source: pipeline.TrainBatches, place: Callable[[types.Batch], types.Batch]):
+        self._source, self._place = source, place
+
+    def __iter__(self) -> Iterator[types.Batch]:
+        return self
+
+    def __next__(self) -> types.Batch:
+        return jax.block_until_ready(self._place(next(self._source)))
+
+    def get_state(self):
+        return self._source.get_state()
+
+
+class _StopRequest:
+    """Turns the first SIGINT or SIGTERM into a wish that the loop sees between two steps; a second one interrupts."""
+
+    def __init__(self):
+        self.requested = False
+        self._before: dict = {}
+
+    def __enter__(self) -> _StopRequest:
+        if threading.current_thread() is threading.main_thread():
+            self._before = {number: signal.signal(number, self._handle) for number in (signal.SIGINT, signal.SIGTERM)}
+        return self
+
+    def __exit__(self, *_) -> None:
+        for number, handler in self._before.items():
+            signal.signal(number, handler)
+
+    def _handle(self, *_) -> None:
+        if self.requested:
+            raise KeyboardInterrupt
+        self.requested = True

@@ -1,0 +1,110 @@
+"""Everything that can be done before the first batch is there: initial state, training step, compilation.
+
+The shapes of a batch follow from the config, so that the step is compiled while the data is still being made.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+
+import jax
+import numpy as np
+
+from muvo_jax import config as config_lib
+from muvo_jax import types
+from muvo_jax.model import world_model
+from muvo_jax.training import optimizer as optimizer_lib
+from muvo_jax.training import parallel as parallel_lib
+from muvo_jax.training import state as state_lib
+from muvo_jax.training import step as step_lib
+
+ROUTE_MAP_PX = 64
+
+
+@dataclasses.dataclass(frozen=True)
+class Prepared:
+    """A run that only lacks data.
+
+    Attributes:
+      model: what is trained.
+      state: at step 0, placed on the devices.
+      step: function(state, placed batch) -> (state, metrics), compiled for `batch_shapes`.
+      batch_shapes: what it was compiled for.
+      initialisation_s, compilation_s: how long these two took.
+    """
+
+    model: world_model.WorldModel
+    state: state_lib.TrainState
+    step: step_lib.SpreadFunction
+    batch_shapes: types.Batch
+    initialisation_s: float
+    compilation_s: float
+
+    @property
+    def parameters(self) -> int:
+        """How many numbers are learned."""
+        return sum(leaf.size for leaf in jax.tree.leaves(self.state.params))
+
+
+def expected_batch(config: config_lib.Config, windows: int, *, rewards: bool = True) -> types.Batch:
+    """The shapes of a batch of `windows` training windows, as jax.ShapeDtypeStruct leaves.
+
+    Args:
+      config: adapted to the data, or a preset of the built-in town.
+      rewards: whether the recording holds reward and is_terminal.
+    """
+    model, prefix = config.model, (windows, config.data.frames)
+
+    def timed(dtype, *shape):
+        return jax.ShapeDtypeStruct((*prefix, *shape), dtype)
+
+    geometry = model.range_view
+    return types.Batch(
+        action=timed(np.float32, 2), is_first=timed(np.bool_), image=timed(np.uint8, *model.image_size, 3),
+        range_view=timed(np.float32, geometry.rows, geometry.columns, 4),
+        occupancy=timed(np.uint8, *model.voxels.shape) if "occupancy" in model.heads else None,
+        route_map=timed(np.uint8, ROUTE_MAP_PX, ROUTE_MAP_PX) if model.route else None,
+        speed_mps=timed(np.float32) if model.speed else None,
+        reward=timed(np.float32) if rewards else None, is_terminal=timed(np.bool_) if rewards else None,
+        intrinsics=jax.ShapeDtypeStruct((windows, 3, 3), np.float32),
+        camera_to_ego=jax.ShapeDtypeStruct((windows, 4, 4), np.float32))
+
+
+def shapes_of(batch: types.Batch) -> types.Batch:
+    """A batch's leaves as jax.ShapeDtypeStruct."""
+    return jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype), batch)
+
+
+def prepare(config: config_lib.Config, batch_shapes: types.Batch) -> Prepared:
+    """Initialises the model and compiles its training step.
+
+    Args:
+      config: of the run.
+      batch_shapes: [train.batch * optimizer.accumulate, frames, ...].
+
+    Raises:
+      ValueError: where the batch cannot be split over the devices.
+    """
+    start_s = time.perf_counter()
+    model = world_model.WorldModel(config.model)
+    step = step_lib.make_train_step(model, config)
+    run_key = jax.random.key(config.train.seed)
+    example = jax.tree.map(lambda leaf: np.zeros((1, *leaf.shape[1:]), leaf.dtype), batch_shapes)
+    variables = model.init(jax.random.fold_in(run_key, 0), example)
+    optimizer = optimizer_lib.make_optimizer(config.optimizer, config.train.steps)
+    state = state_lib.create(variables, optimizer, jax.random.fold_in(run_key, 1))
+    state = jax.block_until_ready(parallel_lib.place_state(step.plan, state))
+    initialised_s = time.perf_counter()
+    placed = jax.tree.map(lambda leaf: np.zeros(leaf.shape, leaf.dtype), batch_shapes)
+    compiled = step.compiled.lower(state, step.place(placed)).compile()
+    return Prepared(model, state, dataclasses.replace(step, compiled=compiled), batch_shapes,
+                    initialised_s - start_s, time.perf_counter() - initialised_s)
+
+
+def recompile(prepared: Prepared, config: config_lib.Config, batch_shapes: types.Batch) -> Prepared:
+    """`prepared` where it already fits, else a new one for what the data turned out to be."""
+    same = (prepared.model.config == config.model
+            and jax.tree.structure(prepared.batch_shapes) == jax.tree.structure(batch_shapes)
+            and jax.tree.leaves(prepared.batch_shapes) == jax.tree.leaves(batch_shapes))
+    return prepared if same else prepare(config, batch_shapes)

@@ -1,0 +1,123 @@
+"""The folder of one run: config.json, metrics.jsonl, TensorBoard events; checkpoints and pictures lie beside them."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import pathlib
+from collections.abc import Mapping
+from typing import Any
+
+import tensorboardX
+
+from muvo_jax import config as config_lib
+from muvo_jax.training import checkpoint
+
+CONFIG_FILE = "config.json"
+METRICS_FILE = "metrics.jsonl"
+PREVIEW_FOLDER = "previews"
+
+
+class RunFolder:
+    """Files of one run. Records are appended line by line, so that a killed run loses none that it reported."""
+
+    def __init__(self, path: str | os.PathLike, first_step: int = 0):
+        self.path = pathlib.Path(path)
+        self._events = tensorboardX.SummaryWriter(str(self.path), purge_step=first_step or None)
+        self._metrics = (self.path / METRICS_FILE).open("a", encoding="utf-8")
+
+    def log(self, record: Mapping[str, Any]) -> None:
+        """Appends one record; numbers also go to TensorBoard under `kind/name`. Not-a-number is written as null."""
+        clean = {name: _json_number(value) for name, value in record.items()}
+        self._metrics.write(json.dumps(clean) + "\n")
+        self._metrics.flush()
+        prefix = "/".join(str(record[name]) for name in ("kind", "split") if name in record)
+        for name, value in record.items():
+            if name != "step" and isinstance(value, (int, float)) and not isinstance(value, bool):
+                self._events.add_scalar(f"{prefix}/{name}", value, record["step"])
+
+    def close(self) -> None:
+        self._metrics.close()
+        self._events.close()
+
+
+def check_new(path: str | os.PathLike, again: str) -> None:
+    """Refuses to start a run where there is one.
+
+    Args:
+      again: the command that goes on with an existing run, for the message.
+
+    Raises:
+      FileExistsError: where it exists and is not empty; nothing in it is touched.
+    """
+    path = pathlib.Path(path)
+    if path.is_dir() and any(path.iterdir()):
+        has_steps = bool(list((path / checkpoint.FOLDER).glob("*")))
+        state = "has checkpoints" if has_steps else "has no checkpoint yet"
+        raise FileExistsError(f"run folder {path} exists and {state}. Go on with it:  {again}   "
+                              f"or start another one with  --name=SOMETHING_NEW")
+    if path.exists() and not path.is_dir():
+        raise FileExistsError(f"{path} is a file, expected a folder for the run: choose another --name.")
+
+
+def create(path: str | os.PathLike, config: config_lib.Config, again: str) -> None:
+    """Makes the folder of a new run and writes its config; refuses as `check_new` does."""
+    check_new(path, again)
+    pathlib.Path(path).mkdir(parents=True, exist_ok=True)
+    write_config(path, config)
+
+
+def write_config(path: str | os.PathLike, config: config_lib.Config) -> None:
+    """Writes RUN/config.json; the file is replaced as a whole."""
+    target = pathlib.Path(path) / CONFIG_FILE
+    partial = target.with_name(CONFIG_FILE + ".part")
+    partial.write_text(json.dumps(config.to_dict(), indent=2) + "\n", encoding="utf-8")
+    partial.replace(target)
+
+
+def read_config(path: str | os.PathLike) -> config_lib.Config:
+    """The config of an existing run.
+
+    Raises:
+      FileNotFoundError: where there is no run.
+      ValueError: where its config.json cannot be understood.
+    """
+    source = pathlib.Path(path) / CONFIG_FILE
+    try:
+        return config_lib.Config.from_dict(json.loads(source.read_text(encoding="utf-8")))
+    except FileNotFoundError as error:
+        raise FileNotFoundError(f"{source} is missing, so there is no run to go on with in {path}. "
+                                f"Leave --resume away to start one.") from error
+    except json.JSONDecodeError as error:
+        raise ValueError(f"{source} is not valid JSON ({error}). Every checkpoint holds a copy of the config: take it "
+                         f"from {path}/{checkpoint.FOLDER}/STEP/meta.") from error
+
+
+def read_metrics(path: str | os.PathLike) -> list[dict[str, Any]]:
+    """All records of a run, oldest first; a line cut short by a crash is left out."""
+    source = pathlib.Path(path) / METRICS_FILE
+    records = []
+    for line in source.read_text(encoding="utf-8").splitlines() if source.is_file() else []:
+        try:
+            records.append(json.loads(line))
+        except json.JSONDecodeError:
+            continue
+    return records
+
+
+def forget_after(path: str | os.PathLike, step: int) -> int:
+    """Removes records of later steps, which a resumed run makes again; returns how many."""
+    records = read_metrics(path)
+    kept = [record for record in records if record["step"] <= step]
+    if len(kept) == len(records):
+        return 0
+    target = pathlib.Path(path) / METRICS_FILE
+    partial = target.with_name(METRICS_FILE + ".part")
+    partial.write_text("".join(json.dumps(record) + "\n" for record in kept), encoding="utf-8")
+    partial.replace(target)
+    return len(records) - len(kept)
+
+
+def _json_number(value):
+    return None if isinstance(value, float) and not math.isfinite(value) else value

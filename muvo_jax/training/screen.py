@@ -1,0 +1,101 @@
+"""What a run shows on screen: lines, and a progress bar where there is a terminal."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping
+
+import rich.console
+import rich.progress
+import rich.text
+
+
+class Screen:
+    """A console with one progress bar; in a log file or a pipe, plain lines take the place of the bar."""
+
+    def __init__(self, console: rich.console.Console | None = None):
+        self.console = console or rich.console.Console(highlight=False, soft_wrap=True)
+        self._bar: rich.progress.Progress | None = None
+        self._task: rich.progress.TaskID | None = None
+
+    def line(self, text: str = "", style: str = "") -> None:
+        self.console.print(text, style=style or None, markup=False)
+
+    def field(self, name: str, value: str) -> None:
+        """One aligned start-up line."""
+        self.console.print(rich.text.Text.assemble((f"{name:>12}  ", "bold cyan"), value))
+
+    def warn(self, text: str) -> None:
+        self.line(f"warning: {text}", style="yellow")
+
+    def start(self, total: int, done: int) -> None:
+        """Shows the bar for `total` steps of which `done` are behind us."""
+        if not self.console.is_terminal:
+            return
+        progress = rich.progress
+        self._bar = progress.Progress(
+            progress.TextColumn("step {task.completed}/{task.total}"), progress.BarColumn(bar_width=24),
+            progress.TextColumn("{task.fields[numbers]}"), progress.TextColumn("ETA"), progress.TimeRemainingColumn(),
+            console=self.console, refresh_per_second=2)
+        self._bar.start()
+        self._task = self._bar.add_task("train", total=total, completed=done, numbers="first step ...")
+
+    def advance(self, done: int, numbers: str) -> None:
+        """Moves the bar."""
+        if self._bar is not None and self._task is not None:
+            self._bar.update(self._task, completed=done, numbers=numbers)
+
+    def log(self, text: str) -> None:
+        """A line that is only needed where there is no bar."""
+        if self._bar is None:
+            self.line(text)
+
+    def stop(self) -> None:
+        if self._bar is not None:
+            self._bar.stop()
+            self._bar = None
+
+
+class Pace:
+    """Steps per second, the share of time spent waiting for data, and the time left, since the last `mark`."""
+
+    def __init__(self):
+        self._since_s = time.perf_counter()
+        self._steps = 0
+        self._waited_s = 0.0
+
+    def step(self, waited_s: float) -> None:
+        self._steps += 1
+        self._waited_s += waited_s
+
+    def mark(self, left: int) -> dict[str, float]:
+        """The figures since the last mark, for `left` steps to go; starts anew."""
+        elapsed_s = max(time.perf_counter() - self._since_s, 1e-9)
+        rate_hz = self._steps / elapsed_s
+        figures = {"steps_per_s": rate_hz, "waiting_percent": 100.0 * self._waited_s / elapsed_s,
+                   "left_s": left / rate_hz if rate_hz else float("nan")}
+        self.restart()
+        return figures
+
+    def restart(self) -> None:
+        """Forgets what was measured, so that validation does not count as slow training."""
+        self._since_s, self._steps, self._waited_s = time.perf_counter(), 0, 0.0
+
+
+def figures_text(numbers: Mapping[str, float]) -> str:
+    """The numbers of a log line: loss, PSNR, pace."""
+    parts = [f"loss {numbers['total']:.4f}"]
+    if "psnr_db" in numbers:
+        parts.append(f"PSNR {numbers['psnr_db']:.2f} dB")
+    parts += [f"{numbers['steps_per_s']:.2f} steps/s", f"waiting for data {numbers['waiting_percent']:.0f} %"]
+    return "  ".join(parts)
+
+
+def duration_text(seconds: float) -> str:
+    """12 s, 3 min 20 s, 1 h 5 min."""
+    if seconds != seconds:
+        return "?"
+    if seconds < 100:
+        return f"{seconds:.0f} s"
+    minutes, rest = divmod(round(seconds), 60)
+    return f"{minutes} min {rest} s" if minutes < 100 else f"{minutes // 60} h {minutes % 60} min"

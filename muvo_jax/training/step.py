@@ -1,0 +1,195 @@
+"""The one training step: losses, gradients and update in a single compiled function, on one device or on many.
+
+Gradient accumulation runs micro-batches one after the other and averages their gradients. BatchNorm moments, SCAL ratios
+and every other mean are those of one micro-batch (over all devices), as in the reference: 16 micro-batches of one window
+are not one batch of 16 windows.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import optax
+
+from muvo_jax import config as config_lib
+from muvo_jax import types
+from muvo_jax.metrics import image as image_metrics
+from muvo_jax.model import rollout, world_model
+from muvo_jax.objectives import total
+from muvo_jax.training import optimizer as optimizer_lib
+from muvo_jax.training import parallel as parallel_lib
+from muvo_jax.training import state as state_lib
+
+Metrics = dict[str, types.Array]
+_VALIDATION_STEP = 2**31 - 1  # folded into the key where training folds its step in; no run gets there
+
+
+@dataclasses.dataclass(frozen=True)
+class SpreadFunction:
+    """A compiled function of a state and a batch that puts both where they belong.
+
+    Attributes:
+      plan: devices and mode.
+      accumulate: micro-batches in a batch.
+      compiled: from `parallel.spread`.
+    """
+
+    plan: parallel_lib.Plan
+    accumulate: int
+    compiled: Callable[[Any, types.Batch], Any]
+
+    def place(self, batch: types.Batch) -> types.Batch:
+        """Splits and uploads a batch; a prefetch thread may do so ahead of the call."""
+        return parallel_lib.place_batch(self.plan, batch, self.accumulate)
+
+    def __call__(self, state: state_lib.TrainState, batch: types.Batch) -> Any:
+        """Runs on leaves [accumulate * B, ...], or on what `place` made of them."""
+        placed = batch if batch.action.ndim > 3 else self.place(batch)
+        return self.compiled(parallel_lib.place_state(self.plan, state), placed)
+
+
+def make_train_step(model: world_model.WorldModel, config: config_lib.Config, *, parallel: str | None = None,
+                    devices: Sequence[jax.Device] | None = None) -> SpreadFunction:
+    """Builds function(state, batch) -> (state, metrics); the state that goes in is donated.
+
+    The metrics are float32 scalars: every loss term (unweighted), "total", "psnr_db" of the observed images,
+    "learning_rate", the norms "gradient_norm", "parameter_norm", "update_norm", and "finite" (1 or 0). An update that is
+    not finite is not applied, so the parameters stay usable; the step is counted.
+
+    Args:
+      model: what is trained.
+      config: losses, optimiser, batch and accumulation.
+      parallel: "auto", "pmap" or "shard_map"; by default config.train.parallel.
+      devices: by default all.
+    """
+    optimizer = optimizer_lib.make_optimizer(config.optimizer, config.train.steps)
+    rate = optimizer_lib.learning_rate(config.optimizer, config.train.steps)
+    gradients_of = gradient_body(model, config)
+
+    def body(state, batch, axis_name):
+        gradients, batch_stats, metrics = gradients_of(state, batch, axis_name)
+        updates, opt_state = optimizer.update(gradients, state.opt_state, state.params)
+        gradient_norm = optax.global_norm(gradients)
+        finite = jnp.isfinite(metrics["total"]) & jnp.isfinite(gradient_norm)
+        before = (state.params, state.batch_stats, state.opt_state)
+        after = (optax.apply_updates(state.params, updates), batch_stats, opt_state)
+        params, batch_stats, opt_state = jax.tree.map(lambda new, old: jnp.where(finite, new, old), after, before)
+        metrics |= {"learning_rate": rate(state.step), "gradient_norm": gradient_norm,
+                    "parameter_norm": optax.global_norm(state.params), "update_norm": optax.global_norm(updates),
+                    "finite": finite.astype(jnp.float32)}
+        return state.replace(step=state.step + 1, params=params, batch_stats=batch_stats, opt_state=opt_state), metrics
+
+    plan = parallel_lib.make_plan(parallel or config.train.parallel, config.train.batch, devices)
+    return SpreadFunction(plan, config.optimizer.accumulate, parallel_lib.spread(plan, body, donate_state=True))
+
+
+def make_validation_step(model: world_model.WorldModel, config: config_lib.Config, *, batch_size: int | None = None,
+                         parallel: str | None = None,
+                         devices: Sequence[jax.Device] | None = None) -> SpreadFunction:
+    """Builds function(state, batch) -> metrics: the loss terms and "psnr_db" without dropout, on running statistics.
+
+    The latents are sampled with keys that depend on the run's key and the place in the batch, not on the step, so that
+    the numbers of two steps compare.
+
+    Args:
+      model, config, parallel, devices: as `make_train_step`.
+      batch_size: windows per call; by default config.train.batch.
+    """
+    def body(state, batch, axis_name):
+        windows = batch[0]  # a single micro-batch
+        keys = sample_keys(state.key, _VALIDATION_STEP, 0, windows.batch_size, axis_name)
+        _, (metrics, _) = forward(state.params, state.batch_stats, windows, keys, model=model, config=config,
+                                  train=False, axis_name=axis_name)
+        return metrics
+
+    plan = parallel_lib.make_plan(parallel or config.train.parallel, batch_size or config.train.batch, devices)
+    return SpreadFunction(plan, 1, parallel_lib.spread(plan, body))
+
+
+def gradient_body(model: world_model.WorldModel, config: config_lib.Config) -> Callable:
+    """Returns body(state, batch [accumulate, b, ...], axis_name) -> (gradients, batch_stats, metrics).
+
+    Gradients and metrics are means over micro-batches, equal on all devices; running statistics pass through the
+    micro-batches in order.
+    """
+    differentiate = jax.value_and_grad(functools.partial(forward, model=model, config=config, train=True), has_aux=True)
+
+    def micro_step(state, batch_stats, batch, index, axis_name):
+        keys = sample_keys(state.key, state.step, index, batch.batch_size, axis_name)
+        (_, (metrics, batch_stats)), gradients = differentiate(state.params, batch_stats, batch, keys,
+                                                               axis_name=axis_name)
+        if axis_name is not None:
+            gradients = jax.lax.pmean(gradients, axis_name)
+        return batch_stats, gradients, metrics
+
+    def body(state, batch, axis_name):
+        count = config.optimizer.accumulate
+        if count == 1:
+            batch_stats, gradients, metrics = micro_step(state, state.batch_stats, batch[0], 0, axis_name)
+            return gradients, batch_stats, metrics
+
+        def scanned(carry, inputs):
+            batch_stats, sums = carry
+            batch_stats, *more = micro_step(state, batch_stats, *inputs, axis_name)
+            return (batch_stats, jax.tree.map(jnp.add, sums, more)), None
+
+        _, *shapes = jax.eval_shape(lambda: micro_step(state, state.batch_stats, batch[0], 0, axis_name))
+        zeros = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
+        (batch_stats, sums), _ = jax.lax.scan(scanned, (state.batch_stats, zeros), (batch, jnp.arange(count)))
+        gradients, metrics = jax.tree.map(lambda value: value / count, sums)
+        return gradients, batch_stats, metrics
+
+    return body
+
+
+def sample_keys(run_key: types.Array, step: int | types.Array, micro_batch: int | types.Array, local_size: int,
+                axis_name: str | None) -> types.Array:
+    """Typed keys [b], one per window: fold_in(fold_in(run_key, step), place of the window in the whole batch).
+
+    The place counts over micro-batches and devices, so the randomness does not depend on how many devices there are.
+    """
+    device, devices = (0, 1) if axis_name is None else (jax.lax.axis_index(axis_name), jax.lax.axis_size(axis_name))
+    first = (micro_batch * devices + device) * local_size
+    step_key = jax.random.fold_in(run_key, step)
+    return jax.vmap(lambda index: jax.random.fold_in(step_key, index))(first + jnp.arange(local_size))
+
+
+def forward(params: Any, batch_stats: Any, batch: types.Batch, keys: types.Array, *, model: world_model.WorldModel,
+            config: config_lib.Config, train: bool, axis_name: str | None) -> tuple[types.Array, tuple[Metrics, Any]]:
+    """Observes a window, decodes every frame and scores it.
+
+    Args:
+      params, batch_stats: the model's variables.
+      batch: the local windows, leaves [b, T, ...].
+      keys: typed keys [b].
+      model, config: what to compute.
+      train: dropout, prior dropout and batch moments; otherwise none and running moments.
+      axis_name: mesh axis the batch is spread over, or None.
+
+    Returns:
+      The total loss of the whole batch, and (metrics, new batch_stats).
+    """
+    maybe_remat = jax.checkpoint if config.train.remat else lambda function: function
+    variables = {"params": params, "batch_stats": batch_stats}
+    observe = functools.partial(rollout.observe_window, model, train=train, axis_name=axis_name)
+    observed, batch_stats = maybe_remat(observe)(variables, batch, keys)
+    predictions = {}
+    for head in model.config.heads:
+        decode = functools.partial(model.decode, heads=(head,))
+        predictions |= maybe_remat(decode)(variables, observed.states.features)
+    terms = total.losses(predictions, batch, observed, model=model.config, loss=config.loss, keys=keys,
+                         axis_name=axis_name)
+    metrics = dict(terms)
+    if "image" in predictions:
+        metrics["psnr_db"] = _mean(image_metrics.frame_psnr_db(predictions["image"][1], batch.image), axis_name)
+    return terms["total"], (metrics, batch_stats)
+
+
+def _mean(values: types.Array, axis_name: str | None) -> types.Array:
+    mean = values.mean()
+    return mean if axis_name is None else jax.lax.pmean(mean, axis_name)

@@ -1,0 +1,59 @@
+"""Chamfer distance: worked arithmetic, holes, subsets, parity with the reference."""
+
+import golden_rule
+import numpy as np
+import pytest
+
+from muvo_jax.metrics import points, streaming
+
+
+def range_view(*pixels):
+    """[1, 1, 1, W, 4] from (x, y, z, range) pixels."""
+    return np.array(pixels, np.float32).reshape(1, 1, 1, -1, 4)
+
+
+def test_worked_arithmetic():
+    # Prediction {0, 3}, truth {0, 1} on the x axis: to truth (0 + 2) / 2, back (0 + 1) / 2; half of the sum is 0.75.
+    prediction = np.array([[0.0, 0, 0], [3, 0, 0]])
+    truth = np.array([[0.0, 0, 0], [1, 0, 0]])
+    assert points.chamfer_m(prediction, truth) == 0.75
+    assert points.chamfer_m(truth, prediction) == 0.75
+    assert points.chamfer_m(truth, truth) == 0.0
+
+
+def test_holes_take_no_part():
+    truth = range_view((1, 0, 0, 1), (0, 0, 0, -1))
+    prediction = range_view((1, 0, 2, 5), (70, 0, 0, 0.5))
+    distance = points.frame_chamfer_m(prediction, truth, return_threshold_m=1.0, points=0, seed=(0,))
+    np.testing.assert_allclose(distance, [[2.0]])
+
+
+def test_an_empty_side_is_undefined_and_not_averaged():
+    truth = np.concatenate([range_view((1, 0, 0, 1)), range_view((0, 0, 0, -1))], axis=1)
+    prediction = np.concatenate([range_view((2, 0, 0, 2))] * 2, axis=1)
+    distance = points.frame_chamfer_m(prediction, truth, return_threshold_m=1.0, points=0, seed=(0,))
+    np.testing.assert_array_equal(distance, [[1.0, np.nan]])
+    stream = streaming.StreamingMean.zeros(2).add(distance)
+    assert (stream.overall(), stream.undefined.sum()) == (1.0, 1)
+
+
+def test_subsets_are_keyed():
+    cloud = np.arange(300.0).reshape(100, 3)
+    first = points.keyed_subset(cloud, 10, (0, 1))
+    assert first.shape == (10, 3)
+    assert len(np.unique(first[:, 0])) == 10
+    np.testing.assert_array_equal(first, points.keyed_subset(cloud, 10, (0, 1)))
+    assert not np.array_equal(first, points.keyed_subset(cloud, 10, (0, 2)))
+    for count in (0, 100, 200):
+        np.testing.assert_array_equal(points.keyed_subset(cloud, count, (0,)), cloud)
+
+
+def test_parity_with_the_reference():
+    golden = golden_rule.Golden("p1_losses_metrics.npz")
+    prediction, truth = (30 * golden_rule.make_input(name, (2, 2, 400, 3), "pm1") * np.float32([1, 1, 0.2])
+                         for name in ("cd_pred", "cd_tgt"))
+    stream = streaming.StreamingMean.zeros(1)
+    for clouds in (prediction, truth + np.float32(0.1)):
+        distances = [points.chamfer_m(a, b) for a, b in zip(clouds.reshape(4, 400, 3), truth.reshape(4, 400, 3), strict=True)]
+        stream = stream.add(np.array(distances)[:, None])
+    assert stream.overall() == pytest.approx(float(golden["metric_cd_1d_2batches"]), rel=1e-5)

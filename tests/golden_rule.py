@@ -1,7 +1,7 @@
 """The deterministic inputs of the parity numbers in tests/golden, and a reader for these files.
 
-The numbers were made by running the authors' PyTorch code on inputs that this rule draws: a NumPy PCG64 stream seeded by
-the CRC-32 of "name|kind|seed", in float64, cast at the end. Arrays come in torch's layout (channels before pixels).
+The numbers were made by running the authors' PyTorch code on inputs that this rule draws: a NumPy PCG64 stream seeded
+by the CRC-32 of "name|kind|seed", in float64, cast at the end. Arrays come in torch's layout (channels before pixels).
 """
 
 from __future__ import annotations
@@ -91,8 +91,8 @@ def make_input(name: str, shape: tuple[int, ...], kind: str, seed: int = 0) -> n
 class Golden:
     """One file of reference numbers.
 
-    An entry is stored whole, or as `name::sub` (every n-th value), `name::meta` ([n, *shape]) and `name::stats` (mean, std,
-    minimum, maximum, L2 norm of all values).
+    An entry is stored whole, or as `name::sub` (every n-th value), `name::meta` ([n, *shape]) and `name::stats` (mean,
+    std, minimum, maximum, L2 norm of all values).
     """
 
     def __init__(self, file: str):

@@ -41,7 +41,7 @@ def read_npz(path: pathlib.Path, name: str) -> np.ndarray:
       DataError: where the file is missing, damaged or lacks the array.
     """
     try:
-        with np.load(path, allow_pickle=False) as arrays:
+        with path.open("rb") as file, np.load(file, allow_pickle=False) as arrays:
             if name not in arrays:
                 raise schema.DataError(f"{path}: holds {', '.join(arrays) or 'nothing'}, expected an array {name!r}.")
             return arrays[name]
@@ -117,26 +117,50 @@ def check_increasing(timestamps_s: np.ndarray, where: Iterable[str]) -> None:
                                f"frames or remove the wrong ones.")
 
 
-def gap_free(present: np.ndarray, timestamps_s: np.ndarray, period_s: float,
-             restarts: np.ndarray | None = None) -> list[tuple[int, int]]:
-    """Cuts a run into (start, length) pieces without a gap.
+def after_gap(timestamps_s: np.ndarray, period_s: float) -> np.ndarray:
+    """bool [F], the frames that come more than 1.5 periods after the one before; NaN times are no gap."""
+    late = np.zeros(len(timestamps_s), bool)
+    late[1:] = np.diff(timestamps_s) > GAP_PERIODS * period_s
+    return late
+
+
+def gap_free(present: np.ndarray, breaks: np.ndarray) -> list[tuple[int, int]]:
+    """Cuts a run into (start, length) pieces.
 
     Args:
       present: bool [F], whether every sensor has the frame.
-      timestamps_s: [F]; a step of more than 1.5 periods is a gap too. NaN where not present.
-      period_s: the nominal time between frames.
-      restarts: bool [F], frames at which a new piece starts.
+      breaks: bool [F], frames that start a new piece in any case.
     """
     pieces: list[tuple[int, int]] = []
     start: int | None = None
     for index in range(len(present)):
-        if start is not None:
-            late = present[index] and timestamps_s[index] - timestamps_s[index - 1] > GAP_PERIODS * period_s
-            if not present[index] or late or (restarts is not None and restarts[index]):
-                pieces.append((start, index - start))
-                start = None
+        if start is not None and (breaks[index] or not present[index]):
+            pieces.append((start, index - start))
+            start = None
         if start is None and present[index]:
             start = index
     if start is not None:
         pieces.append((start, len(present) - start))
     return pieces
+
+
+def warn_of_gaps(where: str, present: np.ndarray, absent: dict[str, int], late: np.ndarray, pieces: int) -> None:
+    """Warns, with counts, of frames that a sensor lacks and of gaps in time; says nothing where there are none.
+
+    Args:
+      where: the run.
+      present: bool [F].
+      absent: sensor -> number of frames it lacks.
+      late: bool [F], see after_gap.
+      pieces: into how many sequences the run falls.
+    """
+    found = []
+    if not present.all():
+        lacking = ", ".join(f"{count} in {sensor}" for sensor, count in absent.items() if count)
+        found.append(f"{int((~present).sum())} of {len(present)} frames are left out because a file is missing "
+                     f"({lacking})")
+    if late.any():
+        found.append(f"time jumps by more than {GAP_PERIODS} periods at {int(late.sum())} of {len(present)} frames")
+    if found:
+        warnings.warn(f"{where}: {' and '.join(found)}; what is left makes {pieces} gap-free sequences.",
+                      schema.DataWarning, stacklevel=4)

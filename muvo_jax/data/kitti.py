@@ -19,7 +19,6 @@ import datetime
 import math
 import pathlib
 import re
-import warnings
 
 import numpy as np
 
@@ -252,15 +251,11 @@ def _read_timestamps(path: pathlib.Path, frame_ids: np.ndarray, present: np.ndar
 
 
 def _cut(drive: _Drive, period_s: float) -> list[schema.Sequence]:
-    """The gap-free sequences of a drive, split at two thirds; warns of frames that a sensor lacks."""
+    """The gap-free sequences of a drive, split at two thirds; warns of gaps."""
     boundary = len(drive.present) * 2 // 3
-    restarts = np.arange(len(drive.present)) == boundary
-    pieces = files.gap_free(drive.present, drive.timestamps_s, period_s, restarts)
+    late = files.after_gap(drive.timestamps_s, period_s)
+    pieces = files.gap_free(drive.present, late | (np.arange(len(late)) == boundary))
     name = drive.folder.resolve().name
-    if not drive.present.all():
-        absent = ", ".join(f"{count} in {sensor}" for sensor, count in drive.absent.items() if count)
-        warnings.warn(f"{name}: {int((~drive.present).sum())} of {len(drive.present)} frames are left out because a "
-                      f"sensor lacks them ({absent}); what is left makes {len(pieces)} gap-free sequences.",
-                      schema.DataWarning, stacklevel=2)
+    files.warn_of_gaps(name, drive.present, drive.absent, late, len(pieces))
     return [schema.Sequence(split="train" if start < boundary else "val", name=name, start=start, length=length)
             for start, length in pieces]

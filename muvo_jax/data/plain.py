@@ -194,7 +194,7 @@ def _modalities(runs: list[_Run]) -> frozenset[str]:
 
 
 def _cut(run: _Run, name: str, modalities: frozenset[str], period_s: float) -> list[schema.Sequence]:
-    """The gap-free sequences of a run (a terminal frame ends one); warns of frames that lack a file."""
+    """The gap-free sequences of a run (a terminal frame ends one); warns of gaps."""
     frame_ids = run.columns["frame_id"].astype(np.int64).tolist()
     absent = {}
     present = np.ones(len(frame_ids), bool)
@@ -204,13 +204,10 @@ def _cut(run: _Run, name: str, modalities: frozenset[str], period_s: float) -> l
             there = np.array([frame_id in have for frame_id in frame_ids], bool)
             present &= there
             absent[folder] = int((~there).sum())
+    late = files.after_gap(run.columns["timestamp_s"], period_s)
     restarts = np.zeros(len(frame_ids), bool)
     if "is_terminal" in modalities:
         restarts[1:] = run.columns["is_terminal"][:-1] > 0
-    pieces = files.gap_free(present, run.columns["timestamp_s"], period_s, restarts)
-    if not present.all():
-        lacking = ", ".join(f"{count} in {folder}" for folder, count in absent.items() if count)
-        warnings.warn(f"{run.folder}: {int((~present).sum())} of {len(present)} frames are left out because a file is "
-                      f"missing ({lacking}); what is left makes {len(pieces)} gap-free sequences.",
-                      schema.DataWarning, stacklevel=3)
+    pieces = files.gap_free(present, late | restarts)
+    files.warn_of_gaps(str(run.folder), present, absent, late & ~restarts, len(pieces))
     return [schema.Sequence(split=run.split, name=name, start=start, length=length) for start, length in pieces]

@@ -22,7 +22,7 @@ from muvo_jax.ops import voxels as voxel_ops
 SHORT_RECORDING_FRAMES = 100
 # What a short recording is cut into: 0.4 s observed and 0.4 s imagined at 10 Hz.
 _SHORT = {"stride": 1, "context": 4, "horizon": 4, "frames": 8}
-_ROW_MULTIPLE = 32
+_SIDE_MULTIPLE = 32
 
 PreparedFrame = dict[str, np.ndarray | np.generic]  # names and dtypes of types.Batch without B and T
 
@@ -48,8 +48,8 @@ def adapt(config: config_lib.Config, recording: schema.Recording, *, keep: Colle
       keep: dotted names, such as "data.stride", that the user chose; they are left alone.
 
     Raises:
-      DataError: where the recording lacks what every model needs (camera, lidar, actions), its image is too flat, its
-        voxel grid does not suit the voxel decoder, or its sequences are shorter than a window.
+      DataError: where the recording lacks what every model needs (camera, lidar, actions), its voxel grid
+        does not suit the voxel decoder, or its sequences are shorter than a window.
     """
     description = recording.description
     notes: list[str] = []
@@ -129,14 +129,11 @@ def _fit_model(model: config_lib.ModelConfig, description: schema.RecordingDescr
 
 
 def _image_size(camera: schema.Camera, columns: int) -> tuple[int, int]:
-    """The preset's width and the largest multiple of 32 rows that the scaled image has."""
-    scaled_rows = round(camera.height_px * columns / camera.width_px)
-    rows = scaled_rows // _ROW_MULTIPLE * _ROW_MULTIPLE
-    if not rows:
-        raise schema.DataError(f"images of {camera.width_px}x{camera.height_px} pixels have {scaled_rows} rows when "
-                               f"scaled to {columns} columns; at least {_ROW_MULTIPLE} are needed. Choose a preset "
-                               f"with wider images, or record higher ones.")
-    return rows, columns
+    """The preset's width and the largest multiple of 32 rows that the scaled image has; wider where it has no 32."""
+    while round(camera.height_px * columns / camera.width_px) < _SIDE_MULTIPLE:
+        columns += _SIDE_MULTIPLE
+    rows = round(camera.height_px * columns / camera.width_px)
+    return rows // _SIDE_MULTIPLE * _SIDE_MULTIPLE, columns
 
 
 def _occupancy_blocks(wanted: int, grid: config_lib.VoxelGrid) -> int:

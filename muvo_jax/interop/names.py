@@ -1,8 +1,8 @@
 """The reference's parameter names and layouts, and ours: a released 1D checkpoint becomes variables of WorldModel.
 
-Ours are translated to theirs by the rules below, so that what a checkpoint lacks and what nothing asks for are both named.
-Layouts: torch keeps (O, I, *K) for convolutions, (I, O, *K) for transposed ones and (O, I) for dense layers; here it is
-[*K, I, O] and [I, O] throughout.
+Ours are translated to theirs by the rules below, so that what a checkpoint lacks and what nothing asks for are both
+named. Layouts: torch keeps (O, I, *K) for convolutions, (I, O, *K) for transposed ones and (O, I) for dense layers;
+here it is [*K, I, O] and [I, O] throughout.
 """
 
 from __future__ import annotations

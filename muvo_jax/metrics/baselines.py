@@ -21,9 +21,9 @@ def copy_last(batch: types.Batch, context: int, horizon: int) -> tuple[Frames, i
       horizon: frames to predict.
 
     Returns:
-      {"image": float32 [B, horizon, H, W, 3] in [0, 1], "range_view": float32 [...] in metres, "occupancy": bool [...]},
-      as read-only views without the modalities that the batch lacks, and the number of voxels copied from unknown
-      (of one frame per window).
+      {"image": float32 [B, horizon, H, W, 3] in [0, 1], "range_view": float32 [...] in metres, "occupancy": bool
+      [...]}, as read-only views without the modalities that the batch lacks, and the number of voxels copied from
+      unknown (of one frame per window).
     """
     last = {name: np.asarray(getattr(batch, name)[:, context - 1]) for name in ("image", "range_view", "occupancy")
             if getattr(batch, name) is not None}

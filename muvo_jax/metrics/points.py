@@ -59,7 +59,8 @@ def frame_chamfer_m(prediction: types.ArrayLike, truth: types.ArrayLike, *, retu
     prediction, truth = np.asarray(prediction), np.asarray(truth)
     distances = np.empty(prediction.shape[:2])
     for window, step in np.ndindex(distances.shape):
-        clouds = (range_view_points(prediction[window, step], return_threshold_m), range_view_points(truth[window, step]))
+        clouds = (range_view_points(prediction[window, step], return_threshold_m),
+                  range_view_points(truth[window, step]))
         distances[window, step] = chamfer_m(*(keyed_subset(cloud, points, (*seed, window, step, side))
                                               for side, cloud in enumerate(clouds)))
     return distances

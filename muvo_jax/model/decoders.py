@@ -18,8 +18,8 @@ _PLANE_KERNELS = (5, 5, 6, 6, 6, 6)
 def plane_start(size: tuple[int, int]) -> tuple[tuple[int, int], tuple[int, int]]:
     """Constant size and stride of the first stage, per axis, so that six stages end at `size` exactly.
 
-    A side that is a multiple of 64 starts at side / 64 and doubles six times, as in the reference (320 x 832 from 5 x 13).
-    One that is a multiple of 32 only starts at side / 32, and the first stage leaves it as it is.
+    A side that is a multiple of 64 starts at side / 64 and doubles six times, as in the reference (320 x 832 from
+    5 x 13). One that is a multiple of 32 only starts at side / 32, and the first stage leaves it as it is.
     """
     halves = tuple(side % 64 == 0 for side in size)
     start = tuple(side // 64 if even else side // 32 for side, even in zip(size, halves, strict=True))
@@ -41,7 +41,7 @@ class UpStage(linen.Module):
 
 
 class PlaneDecoder(linen.Module):
-    """Features -> planes [N, H/scale, W/scale, channels] by a stack of transposed convolutions; no output activation."""
+    """Features -> planes [N, H/scale, W/scale, channels]: a stack of transposed convolutions, no output activation."""
 
     size: tuple[int, int]
     channels: int

@@ -27,7 +27,8 @@ class Compression(linen.Module):
 class TransformerFusion(linen.Module):
     """TR: the cells of both maps are tokens of one transformer; each sensor's tokens are then pooled to a vector.
 
-    Image and lidar maps [N, h, w, token_channels], measurements each [N, measurement_channels] -> [N, embedding_channels].
+    Image and lidar maps [N, h, w, token_channels], measurements each [N, measurement_channels]
+    -> [N, embedding_channels].
     """
 
     config: ModelConfig

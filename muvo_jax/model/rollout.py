@@ -1,7 +1,7 @@
 """Loops around the world model's two steps: filtering a window, dreaming on from a state, and decoding either.
 
-Every random number comes from a key per sample, so that a sample's numbers depend neither on the rest of the batch nor on
-the number of devices.
+Every random number comes from a key per sample, so that a sample's numbers depend neither on the rest of the batch nor
+on the number of devices.
 """
 
 from __future__ import annotations
@@ -61,7 +61,7 @@ def silence(batch_size: int, frames: int, channels: int) -> StepNoise:
 
 def filter_embeddings(model: WorldModel, variables: Variables, embedding: jax.Array, action: jax.Array,
                       is_first: jax.Array, noise: StepNoise) -> Observed:
-    """Scans observe_step from the zero state over [B, T, ...]; step t is driven by action[t - 1], the first one by zeros."""
+    """Scans observe_step from the zero state over [B, T, ...]; action[t - 1] drives step t, zeros the first one."""
     previous = jnp.concatenate([jnp.zeros_like(action[:, :1]), action[:, :-1]], axis=1)
 
     def step(state, inputs):

@@ -3,8 +3,9 @@
 A step is deterministic given its noise. Every transition of the registry offers the same three things: `initial_state`,
 `observe_step` and `imagine_step`, over muvo_jax.types.LatentState and Gaussian.
 
-The action enters the prior and the posterior, not the recurrence, as in the reference. Differs from the reference in the
-slope of its leaky ReLUs, 0.01 here and 1 there (numerics="reference"), and in drawing the RSSM dropout's coin per sample.
+The action enters the prior and the posterior, not the recurrence, as in the reference. Differs from the reference in
+the slope of its leaky ReLUs, 0.01 here and 1 there (numerics="reference"), and in drawing the RSSM dropout's coin per
+sample instead of per batch.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ LEAKY_SLOPE = {"standard": 0.01, "reference": 1.0}
 
 
 class GRUCell(linen.Module):
-    """Torch's GRU: (state [..., D], input [..., I]) -> state. Gates in the order reset, update, new; two bias vectors."""
+    """Torch's GRU, (state [..., D], x [..., I]) -> state: gates in the order reset, update, new; two bias vectors."""
 
     features: int
     compute: layers.Compute = layers.Compute()

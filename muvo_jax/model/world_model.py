@@ -165,7 +165,7 @@ class WorldModel:
 
     def imagine_step(self, variables: Variables, noise: jax.Array, action: jax.Array,
                      state: LatentState) -> tuple[LatentState, Gaussian]:
-        """Moves the state [B, ...] one step by action [B, 2] alone; noise is standard normal [B, S], zeros for the mean."""
+        """Moves the state [B, ...] one step by action [B, 2] alone; noise: standard normal [B, S], or zeros."""
         return Network(self.config).apply(variables, noise, action, state, method="imagine_step")
 
     def decode(self, variables: Variables, features: jax.Array, heads: Sequence[str] | None = None) -> Predictions:
@@ -186,7 +186,8 @@ class WorldModel:
         names = self.config.heads if heads is None else tuple(heads)
         unknown = [name for name in names if name not in self.config.heads]
         if unknown:
-            raise ValueError(f"decode: this model has no head {', '.join(unknown)}; it has {', '.join(self.config.heads)}.")
+            raise ValueError(f"decode: this model has no head {', '.join(unknown)}; "
+                             f"it has {', '.join(self.config.heads)}.")
         lead = features.shape[:-1]
         flat = Network(self.config).apply(variables, features.reshape(-1, features.shape[-1]), names, method="decode")
         return {name: {scale: _in_units(value, name, self.config).reshape(*lead, *value.shape[1:])
@@ -208,8 +209,8 @@ class WorldModel:
                 raise ValueError(f"Batch.{name} is None, but the model reads it; switch it off in the configuration of "
                                  f"the model or give it.")
             if value.shape[2:] != shape:
-                raise ValueError(f"Batch.{name}: got {list(value.shape)}, expected [B, T, {', '.join(map(str, shape))}] "
-                                 f"as the model's configuration says.")
+                raise ValueError(f"Batch.{name}: got {list(value.shape)}, expected "
+                                 f"[{', '.join(map(str, ('B', 'T', *shape)))}] as the model's configuration says.")
             frames[name] = jnp.reshape(value, (-1, *shape))
         return frames
 
@@ -222,8 +223,9 @@ def _in_units(value: jax.Array, name: str, config: ModelConfig) -> jax.Array:
 @functools.lru_cache(maxsize=8)
 def _variable_shapes(network: Network) -> dict[str, Any]:
     config = network.config
+    range_size = (config.range_view.rows, config.range_view.columns)
     frames = {"image": jax.ShapeDtypeStruct((1, *config.image_size, 3), jnp.uint8),
-              "range_view": jax.ShapeDtypeStruct((1, config.range_view.rows, config.range_view.columns, 4), jnp.float32),
+              "range_view": jax.ShapeDtypeStruct((1, *range_size, 4), jnp.float32),
               "route_map": jax.ShapeDtypeStruct((1, *ROUTE_MAP_SIZE), jnp.uint8),
               "speed_mps": jax.ShapeDtypeStruct((1,), jnp.float32)}
     state = jax.eval_shape(lambda: WorldModel(config).initial_state(1))

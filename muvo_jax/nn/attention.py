@@ -28,7 +28,8 @@ def sine_positions(size: tuple[int, ...], channels: int) -> np.ndarray:
     """
     share, rest = divmod(channels, len(size))
     if rest or share % 2:
-        raise ValueError(f"sine_positions: {channels} channels, expected a multiple of {2 * len(size)} for {len(size)} axes.")
+        raise ValueError(f"sine_positions: got {channels} channels, expected a multiple of {2 * len(size)} for "
+                         f"{len(size)} axes.")
     frequencies = _TEMPERATURE ** (-2.0 * (np.arange(share) // 2) / share)
     encoded = []
     for axis, count in enumerate(size):
@@ -111,6 +112,6 @@ class TransformerEncoder(linen.Module):
     @linen.compact
     def __call__(self, x: jax.Array, keys: jax.Array | None = None) -> jax.Array:
         for index in range(self.layers_count):
-            layer = EncoderLayer(self.heads, self.hidden_channels, self.dropout_rate, self.compute, name=f"layer{index}")
-            x = layer(x, keys, SITES_PER_LAYER * index)
+            x = EncoderLayer(self.heads, self.hidden_channels, self.dropout_rate, self.compute,
+                             name=f"layer{index}")(x, keys, SITES_PER_LAYER * index)
         return x

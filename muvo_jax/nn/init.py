@@ -13,8 +13,8 @@
 | running mean; running variance | 0; 1 |
 
 Torch's default would shrink the signal of a transposed stack several times a layer, and start adaptive norms at a scale
-near 0; both make the decoders slow to start, so these two depart from the reference (which matters to fresh models only).
-1.5 makes up for ELU's loss of variance.
+near 0; both make the decoders slow to start, so these two depart from the reference (which matters to fresh models
+only). 1.5 makes up for ELU's loss of variance.
 """
 
 from __future__ import annotations
@@ -90,7 +90,7 @@ def _has_zero_bias(path: tuple[str, ...], siblings: Mapping[str, tuple[int, ...]
 
 
 def _reaching_inputs(leaf: str, shape: tuple[int, ...]) -> float:
-    """Input values that reach one output value, on average: all taps of a seed's one pixel, at stride 2 one tap in 2**d."""
+    """Input values that reach one output value: all of a seed's one pixel, at stride 2 one tap in 2**d of each."""
     if leaf == "seed_kernel":
         return shape[-2]
     return shape[-2] * math.prod(shape[:-2]) / 2 ** (len(shape) - 2)

@@ -1,8 +1,8 @@
 """Dense, convolution and transposed convolution as Flax modules over muvo_jax.ops, channels last.
 
-Parameters stay float32 and are cast to the compute dtype where they are used. The modules declare shapes only: their own
-initialiser gives zeros, and muvo_jax.nn.init fills the shapes by rules (tracing random initialisers is what makes the
-usual `module.init` slow to compile).
+Parameters stay float32 and are cast to the compute dtype where they are used. The modules declare shapes only: their
+own initialiser gives zeros, and muvo_jax.nn.init fills the shapes by rules (tracing random initialisers is what makes
+the usual `module.init` slow to compile).
 """
 
 from __future__ import annotations
@@ -103,8 +103,8 @@ class ConvTranspose(linen.Module):
         excess = [size - step for size, step in zip(self.kernel_size, self.stride, strict=True)]
         y = conv_ops.conv_transpose(
             x.astype(self.compute.dtype), kernel.astype(self.compute.dtype), stride=self.stride,
-            padding=tuple(math.ceil(extra / 2) for extra in excess), output_padding=tuple(extra % 2 for extra in excess),
-            implementation=self.compute.convolution)
+            padding=tuple(math.ceil(extra / 2) for extra in excess),
+            output_padding=tuple(extra % 2 for extra in excess), implementation=self.compute.convolution)
         return y + per_channel(bias.astype(y.dtype), y.ndim)
 
 

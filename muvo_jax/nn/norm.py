@@ -1,8 +1,8 @@
 """Normalisation layers with float32 statistics: batch (synchronised over devices), layer, and adaptive instance norm.
 
-Differs from flax.linen.BatchNorm where torch does: momentum 0.1, eps 1e-5, the running variance is the unbiased one, and
-the variance is computed in two passes (no cancellation). Over an axis name, counts and sums are added up over the devices
-before any division, so that the statistics are those of the whole batch.
+Differs from flax.linen.BatchNorm where torch does: momentum 0.1, eps 1e-5, the running variance is the unbiased one,
+and the variance is computed in two passes (no cancellation). Over an axis name, counts and sums are added up over the
+devices before any division, so that the statistics are those of the whole batch.
 """
 
 from __future__ import annotations
@@ -83,7 +83,7 @@ class LayerNorm(linen.Module):
 
 
 class AdaptiveInstanceNorm(linen.Module):
-    """Normalises x [N, *S, C] per sample and channel over space, then scales and shifts by affine maps of a style [N, F].
+    """Normalises x [N, *S, C] per sample and channel over space; scale and shift are affine maps of a style [N, F].
 
     The scale is the map's output itself, not 1 plus it, as in the reference (StyleGAN).
     """

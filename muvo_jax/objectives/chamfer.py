@@ -1,7 +1,7 @@
 """Optional Chamfer term between predicted and measured lidar points.
 
-The third point-cloud term of paper Eq. 1, which neither its text nor the reference's code defines: here the mean nearest
-distance from prediction to truth plus the same backwards, over a keyed subset of the returns of each frame.
+The third point-cloud term of paper Eq. 1, which neither its text nor the reference's code defines: here the mean
+nearest distance from prediction to truth plus the same backwards, over a keyed subset of the returns of each frame.
 """
 
 from __future__ import annotations
@@ -65,7 +65,7 @@ def _masked_mean(values: types.Array, mask: types.Array) -> types.Array:
 
 
 def _subset(cloud: types.Array, mask: types.Array, key: types.Array, points: int) -> tuple[types.Array, types.Array]:
-    """At most `points` of the masked rows of a [P, 4] range view, uniformly without repetition, as [K, 3] and a mask."""
+    """At most `points` of the masked rows of a [P, 4] range view, without repetition, as [K, 3] and a mask."""
     score = jnp.where(mask, jax.random.uniform(key, mask.shape, minval=0.5), 0.0)
     score, index = jax.lax.top_k(score, min(points, cloud.shape[0]))
     return cloud[index, :3], score > 0.0

@@ -3,9 +3,9 @@
 The divergence is summed over channels and averaged over batch and time. One share trains the prior towards a fixed
 posterior, the rest trains the posterior towards a fixed prior.
 
-Standard: KL(posterior_t || prior_t) at every t; the first prior is that of the zero state. The reference leaves the first
-prior out and compares the first posterior with N(0, 1), and by a slip of an index it takes the posterior's std of step 1
-with the mean of step 0; `numerics="reference"` keeps that.
+Standard: KL(posterior_t || prior_t) at every t; the first prior is that of the zero state. The reference leaves the
+first prior out and compares the first posterior with N(0, 1), and by a slip of an index it takes the posterior's std of
+step 1 with the mean of step 0; `numerics="reference"` keeps that.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Targets at the decoders' scales (paper section III-D): full size, half and quarter.
 
-Images are averaged over 2x2 pixels. Range views and occupancy are subsampled (index 2i), because the mean of a return and
-of a hole, or of a class and "unknown", means nothing. Each scale comes from the one before, as in the reference.
+Images are averaged over 2x2 pixels. Range views and occupancy are subsampled (index 2i), because the mean of a return
+and of a hole, or of a class and "unknown", means nothing. Each scale comes from the one before, as in the reference.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """Occupancy terms: cross-entropy and the semantic and geometric scene-class affinity losses (SCAL, MonoScene).
 
-SCAL is -log of precision, recall and specificity over the whole batch, so it cannot be a mean of per-device values. With
-two classes all of it follows from four soft counts (probability mass that is truly or falsely occupied or empty): these
-sums add over samples and devices, and the logarithms come last.
+SCAL is -log of precision, recall and specificity over the whole batch, so it cannot be a mean of per-device values.
+With two classes all of it follows from four soft counts (probability mass that is truly or falsely occupied or empty):
+these sums add over samples and devices, and the logarithms come last.
 
 Differences from the reference: a ratio whose denominator is zero (no occupied, or no empty, voxel in the batch) is left
 out; there the geometric loss of the reference raises.

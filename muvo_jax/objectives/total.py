@@ -1,7 +1,7 @@
 """The training loss (paper Eq. 1): every term named, weighted and checked as a set.
 
-All terms are first reduced to sums that add over samples; `axis_name` sums these over devices, and only then are ratios,
-logarithms and means taken. So the loss of a batch does not depend on how many devices share it.
+All terms are first reduced to sums that add over samples; `axis_name` sums these over devices, and only then are
+ratios, logarithms and means taken. So the loss of a batch does not depend on how many devices share it.
 """
 
 from __future__ import annotations

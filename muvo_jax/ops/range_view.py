@@ -24,8 +24,8 @@ def check_points(points_m: np.ndarray, name: str = "points_m") -> np.ndarray:
     points_m = np.asarray(points_m, dtype=np.float32)
     if points_m.ndim != 2 or points_m.shape[1] != 3:
         raise ValueError(f"{name}: got shape {points_m.shape}, expected [points, 3] (x, y, z in metres).")
-    finite = np.isfinite(points_m).all(axis=1)
-    if not finite.all():
+    if not np.isfinite(points_m).all():
+        finite = np.isfinite(points_m).all(axis=1)
         raise ValueError(f"{name}: {int((~finite).sum())} of {len(points_m)} points are NaN or infinite (the first is "
                          f"point {int(np.argmin(finite))}); remove them before projecting, as in "
                          f"points[np.isfinite(points).all(axis=1)].")

@@ -26,15 +26,15 @@ def voxelize(points_m: np.ndarray, grid: config_lib.VoxelGrid) -> np.ndarray:
     Raises:
       ValueError: for another shape or for points that are not finite.
     """
-    index, inside = voxel_index(points_m, grid)
-    occupied = np.zeros(grid.shape, np.uint8)
-    occupied[tuple(index[inside].T)] = 1
-    return occupied
+    number = _flat_index(_in_voxels(points_m, grid), grid)
+    occupied = np.zeros(int(np.prod(grid.shape)), np.uint8)
+    occupied[number[number >= 0]] = 1
+    return occupied.reshape(grid.shape)
 
 
 def voxel_index(points_m: np.ndarray, grid: config_lib.VoxelGrid) -> tuple[np.ndarray, np.ndarray]:
     """Returns the voxel of each point, int32 [P, 3], and whether it lies inside the grid, bool [P]."""
-    index = np.floor(_in_voxels(points_m, grid)).astype(np.int32)
+    index = np.floor(_in_voxels(points_m, grid)).astype(np.int32).T
     inside = ((index >= 0) & (index < np.asarray(grid.shape, np.int32))).all(axis=1)
     return index, inside
 
@@ -56,14 +56,15 @@ def carve(origin_m: np.ndarray, endpoints_m: np.ndarray, grid: config_lib.VoxelG
       ValueError: for another shape or for points that are not finite.
     """
     ends = _in_voxels(endpoints_m, grid)
-    starts = _in_voxels(np.broadcast_to(np.asarray(origin_m, np.float32), ends.shape), grid)
-    end_voxel = _flat_index(np.floor(ends), grid)
+    origin_m = np.asarray(origin_m, np.float32)
+    starts = np.broadcast_to(_in_voxels(np.atleast_2d(origin_m), grid), ends.shape)
+    end_voxel = _flat_index(ends, grid)
     starts, ends, reaches = _clip_to_grid(starts, ends, grid)
-    starts, ends, end_voxel = starts[reaches], ends[reaches], end_voxel[reaches]
+    starts, ends, end_voxel = starts[:, reaches], ends[:, reaches], end_voxel[reaches]
 
     passed = np.zeros(int(np.prod(grid.shape)), bool)
-    limit = np.asarray(grid.shape, np.float32) - 1
-    start_voxel = _flat_index(np.clip(np.floor(starts), 0, limit), grid)
+    limit = np.asarray(grid.shape, np.float32)[:, None] - 1
+    start_voxel = _flat_index(np.clip(starts, 0, limit), grid)
     passed[start_voxel[start_voxel != end_voxel]] = True
     for axis in range(3):
         passed[_entered_by_crossing(starts, ends, end_voxel, axis, grid)] = True
@@ -109,54 +110,59 @@ def _strided(origins_m: np.ndarray, stride: int) -> np.ndarray:
 
 
 def _in_voxels(points_m: np.ndarray, grid: config_lib.VoxelGrid) -> np.ndarray:
-    """Coordinates in units of voxels from the lower corner of the grid."""
+    """Coordinates in units of voxels from the lower corner of the grid, one row per axis: float32 [3, P]."""
     points_m = range_view.check_points(points_m)
-    return (points_m - np.asarray(grid.origin_m, np.float32)) * np.float32(1.0 / grid.voxel_size_m)
+    corner = np.asarray(grid.origin_m, np.float32)[:, None]
+    return (np.ascontiguousarray(points_m.T) - corner) * np.float32(1.0 / grid.voxel_size_m)
 
 
-def _flat_index(index: np.ndarray, grid: config_lib.VoxelGrid) -> np.ndarray:
-    """Row-major voxel number of integral [P, 3] indices, int32, -1 outside the grid."""
-    inside = ((index >= 0) & (index < np.asarray(grid.shape, np.float32))).all(axis=1)
-    number = (index[:, 0] * grid.shape[1] + index[:, 1]) * grid.shape[2] + index[:, 2]
-    return np.where(inside, number, -1).astype(np.int32)
+def _flat_index(coordinates: np.ndarray, grid: config_lib.VoxelGrid) -> np.ndarray:
+    """Row-major number of the voxel around each of [3, P] coordinates, int32 [P], -1 outside the grid."""
+    number = np.zeros(coordinates.shape[1], np.int32)
+    inside = np.ones(coordinates.shape[1], bool)
+    for axis, size in enumerate(grid.shape):
+        inside &= (coordinates[axis] >= 0) & (coordinates[axis] < size)
+        # Far coordinates would overflow; what is outside is masked in the end.
+        number = number * np.int32(size) + np.clip(coordinates[axis], 0, size).astype(np.int32)
+    return np.where(inside, number, -1)
 
 
 def _clip_to_grid(starts: np.ndarray, ends: np.ndarray,
                   grid: config_lib.VoxelGrid) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Cuts segments (in voxels) to the box of the grid; the third result says which segments touch it at all."""
-    size = np.asarray(grid.shape, np.float32)
+    """Cuts segments (in voxels, [3, P]) to the box of the grid; the third result says which touch it at all, [P]."""
+    size = np.asarray(grid.shape, np.float32)[:, None]
     direction = ends - starts
     safe = np.where(direction == 0, np.float32(1e-20), direction)
     with np.errstate(over="ignore"):
         at_low, at_high = -starts / safe, (size - starts) / safe
-    enter = np.maximum(np.minimum(at_low, at_high).max(axis=1), 0)[:, None]
-    leave = np.minimum(np.maximum(at_low, at_high).min(axis=1), 1)[:, None]
+    enter = np.maximum(np.minimum(at_low, at_high).max(axis=0), 0)
+    leave = np.minimum(np.maximum(at_low, at_high).min(axis=0), 1)
     clipped_starts = np.where(enter > 0, starts + direction * enter, starts)
     clipped_ends = np.where(leave < 1, starts + direction * leave, ends)
-    return clipped_starts, clipped_ends, (enter < leave)[:, 0]
+    return clipped_starts, clipped_ends, enter < leave
 
 
 def _entered_by_crossing(starts: np.ndarray, ends: np.ndarray, end_voxel: np.ndarray, axis: int,
                          grid: config_lib.VoxelGrid) -> np.ndarray:
     """Numbers of the voxels that rays enter through grid planes perpendicular to `axis`, end voxels left out."""
     strides = (grid.shape[1] * grid.shape[2], grid.shape[2], 1)
-    first, last = (np.clip(np.floor(side[:, axis]), 0, grid.shape[axis] - 1).astype(np.int32)
+    first, last = (np.clip(np.floor(side[axis]), 0, grid.shape[axis] - 1).astype(np.int32)
                    for side in (starts, ends))
     crosses = first != last
-    starts, ends, first, last = starts[crosses], ends[crosses], first[crosses], last[crosses]
-    moving = ends[:, axis] - starts[:, axis]
+    starts, ends, first, last = starts[:, crosses], ends[:, crosses], first[crosses], last[crosses]
+    moving = ends[axis] - starts[axis]
     sign = np.sign(last - first).astype(np.int32)
     count = np.abs(last - first)
     step = np.arange(count.sum(), dtype=np.int32) - np.repeat(np.cumsum(count, dtype=np.int32) - count, count)
     # The plane between voxels k and k+1 lies at k+1; what follows is anchored at the first plane each ray crosses.
-    to_plane = (first + (sign > 0)).astype(np.float32) - starts[:, axis]
+    to_plane = (first + (sign > 0)).astype(np.float32) - starts[axis]
     step_float, sign_float = step.astype(np.float32), sign.astype(np.float32)
     number = (np.repeat(first + sign, count) + np.repeat(sign, count) * step) * np.int32(strides[axis])
     for other in range(3):
         if other == axis:
             continue
-        slope = (ends[:, other] - starts[:, other]) / moving
-        anchor = starts[:, other] + to_plane * slope
+        slope = (ends[other] - starts[other]) / moving
+        anchor = starts[other] + to_plane * slope
         index = (np.repeat(anchor, count) + np.repeat(sign_float * slope, count) * step_float).astype(np.int32)
         number += np.clip(index, 0, grid.shape[other] - 1) * np.int32(strides[other])
     return number[number != np.repeat(end_voxel[crosses], count)]

@@ -57,7 +57,7 @@ class Job:
 
 @dataclasses.dataclass(frozen=True)
 class Outcome:
-    """How a run ended: its config as fitted to the data, the step reached, and whether it was stopped before the end."""
+    """How a run ended: its config as fitted to the data, the step reached, whether it was stopped before the end."""
 
     config: config_lib.Config
     step: int
@@ -283,9 +283,9 @@ class _Run:
             self.show.line(f"stopped at step {self.done} of {total}; saved. Go on with:  {self.job.resume_command}")
         steady_s = sorted(self.step_times_s[1:])
         if steady_s:
-            self.show.line(f"{len(self.step_times_s)} steps, median {steady_s[len(steady_s) // 2]:.3f} s each; peak memory "
-                           f"{peak_memory_gib():.2f} GiB; {screen.duration_text(time.perf_counter() - self.job.started_s)} "
-                           f"since the start")
+            median_s, age_s = steady_s[len(steady_s) // 2], time.perf_counter() - self.job.started_s
+            self.show.line(f"{len(self.step_times_s)} steps, median {median_s:.3f} s each; peak memory "
+                           f"{peak_memory_gib():.2f} GiB; {screen.duration_text(age_s)} since the start")
         elif not self.step_times_s:
             self.show.line(f"nothing left to train: step {self.done} of {total} is reached (more with --steps).")
 

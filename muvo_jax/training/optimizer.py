@@ -1,7 +1,8 @@
 """AdamW under torch's OneCycle schedule, as the reference trains.
 
-Own schedule, because optax's one-cycle differs from torch's by up to 8e-4 and leaves beta1 alone, which torch cycles against
-the rate by default. Weight decay applies to every parameter that does not have exactly one axis (the reference's groups).
+Own schedule, because optax's one-cycle differs from torch's by up to 8e-4 and leaves beta1 alone, which torch cycles
+against the rate by default. Weight decay applies to every parameter that does not have exactly one axis, as in the
+reference.
 """
 
 from __future__ import annotations

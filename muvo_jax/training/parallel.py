@@ -3,8 +3,8 @@
 `pmap` and `shard_map` run the same body on the same state; `jax.pmap` gets the state by in_axes=None, so that it has no
 device axis and a checkpoint does not know how many devices wrote it. The body is written per device: it sums over
 `AXIS` before every ratio and averages gradients with `pmean`. That is right for pmap, and for shard_map with
-check_vma=False, where the transpose of a sum over devices is again a sum; with check_vma=True the same code would return
-gradients that are too large by the number of devices (Adam hides such a factor, so the tests compare raw gradients).
+check_vma=False, where the transpose of a sum over devices is again a sum; with check_vma=True the same code would scale
+the gradients wrongly (Adam hides such a factor, so the tests compare raw gradients).
 """
 
 from __future__ import annotations

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Iterator, Mapping
 
 import rich.console
 import rich.progress
@@ -27,6 +28,29 @@ class Screen:
 
     def warn(self, text: str) -> None:
         self.line(f"warning: {text}", style="yellow")
+
+    @contextlib.contextmanager
+    def counter(self, title: str, unit: str) -> Iterator[Callable[[int, int], None]]:
+        """Yields progress(done, total) for something that may take a while; shows nothing where it is never called."""
+        if self.console.is_terminal:
+            progress = rich.progress
+            bar = progress.Progress(progress.TextColumn(title), progress.BarColumn(bar_width=24),
+                                    progress.TextColumn("{task.completed}/{task.total} " + unit),
+                                    progress.TimeRemainingColumn(), console=self.console, transient=True)
+            task = bar.add_task(title, total=None, visible=False)
+            with bar:
+                yield lambda done, total: bar.update(task, completed=done, total=total, visible=True)
+            return
+        told = -1
+
+        def tell(done: int, total: int) -> None:
+            nonlocal told
+            quarter = 4 * done // max(total, 1)
+            if quarter > told:
+                told = quarter
+                self.line(f"{title}: {done}/{total} {unit}")
+
+        yield tell
 
     def start(self, total: int, done: int) -> None:
         """Shows the bar for `total` steps of which `done` are behind us."""

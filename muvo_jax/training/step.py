@@ -1,8 +1,8 @@
 """The one training step: losses, gradients and update in a single compiled function, on one device or on many.
 
-Gradient accumulation runs micro-batches one after the other and averages their gradients. BatchNorm moments, SCAL ratios
-and every other mean are those of one micro-batch (over all devices), as in the reference: 16 micro-batches of one window
-are not one batch of 16 windows.
+Gradient accumulation runs micro-batches one after the other and averages their gradients. BatchNorm moments, SCAL
+ratios and every other mean are those of one micro-batch (over all devices), as in the reference: 16 micro-batches of
+one window are not one batch of 16 windows.
 """
 
 from __future__ import annotations
@@ -58,8 +58,8 @@ def make_train_step(model: world_model.WorldModel, config: config_lib.Config, *,
     """Builds function(state, batch) -> (state, metrics); the state that goes in is donated.
 
     The metrics are float32 scalars: every loss term (unweighted), "total", "psnr_db" of the observed images,
-    "learning_rate", the norms "gradient_norm", "parameter_norm", "update_norm", and "finite" (1 or 0). An update that is
-    not finite is not applied, so the parameters stay usable; the step is counted.
+    "learning_rate", the norms "gradient_norm", "parameter_norm", "update_norm", and "finite" (1 or 0). An update that
+    is not finite is not applied, so the parameters stay usable; the step is counted.
 
     Args:
       model: what is trained.

@@ -63,15 +63,13 @@ def views_of_batch(batch: types.Batch, sample: int) -> list[View]:
             for frame in range(batch.frames)]
 
 
-def views_of_predictions(predictions: Mapping[str, Mapping[int, np.ndarray]], sample: int | tuple[int, ...]
-                         ) -> list[View]:
-    """The decoded frames of one window, from full-scale predictions [B, T, ...] (`sample` may index more axes)."""
-    full = {head: np.asarray(scales[1][sample]) for head, scales in predictions.items()}
-    if "occupancy" in full:
-        full["occupancy"] = (full["occupancy"][..., 1] > full["occupancy"][..., 0]).astype(np.uint8)
-    frames = next(iter(full.values())).shape[0]
-    known = {field.name for field in dataclasses.fields(View)}
-    return [View(**{head: value[frame] for head, value in full.items() if head in known}) for frame in range(frames)]
+def views_of_frames(frames: Mapping[str, np.ndarray], sample: int | tuple[int, ...]) -> list[View]:
+    """The decoded frames of one window: {head: [B, T, ...]}, occupancy as bool; `sample` may index more axes."""
+    chosen = {name: np.asarray(value[sample]) for name, value in frames.items()}
+    if "occupancy" in chosen:
+        chosen["occupancy"] = chosen["occupancy"].astype(np.uint8)
+    count = next(iter(chosen.values())).shape[0]
+    return [View(**{name: value[frame] for name, value in chosen.items()}) for frame in range(count)]
 
 
 def dream_frame(columns: Sequence[tuple[str, View]], scene: Scene, *, badge: str, caption: str,

@@ -10,6 +10,8 @@ DRIVE = "2011_09_26_drive_0099_sync"
 FRAMES = 12
 # A level camera 0.3 m ahead of the lidar and 0.08 m below it, looking forward: camera x = -lidar y, y = -z, z = x.
 VELO_TO_CAM = "R: 0 -1 0 0 0 -1 1 0 0\nT: 0 -0.08 -0.3\ndelta_f: 0 0\n"
+COLUMNS = ("frame_id", "timestamp_s", "x_m", "y_m", "yaw_rad", "speed_mps", "acceleration", "steering", "reward",
+           "is_terminal", "weather")
 WIDTH, HEIGHT, FOCAL = 128, 48, 70.0
 
 
@@ -69,8 +71,8 @@ def write_plain(root: pathlib.Path, runs: dict[str, int] | None = None, **header
             np.savez(folder / f"occupancy/{frame:06d}.npz", occupancy=np.full((16, 16, 16), 255, np.uint8))
         with (folder / "frames.csv").open("w", newline="") as file:
             writer = csv.writer(file)
-            writer.writerow("frame_id timestamp_s x_m y_m yaw_rad speed_mps acceleration steering reward is_terminal "
-                            "weather".split())
+            writer.writerow(COLUMNS)
             for frame in range(frames):
-                writer.writerow([frame, 0.1 * frame, frame, 0, 0, 5.5, 0.25, -0.5, 1.0, int(frame == frames - 1), "noon"])
+                terminal = int(frame == frames - 1)
+                writer.writerow([frame, 0.1 * frame, frame, 0, 0, 5.5, 0.25, -0.5, 1.0, terminal, "noon"])
     return root

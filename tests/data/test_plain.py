@@ -39,11 +39,13 @@ def test_a_run_without_table_is_left_out_with_a_warning(tmp_path):
     assert [s.name for s in recording.sequences] == ["train/a", "val_rl/c"]
 
 
-@pytest.mark.parametrize("file", ["image/000004.png", "lidar/000004.npz", "occupancy/000004.npz", "route_map/000004.png"])
+@pytest.mark.parametrize("file", ["image/000004.png", "lidar/000004.npz", "occupancy/000004.npz",
+                                  "route_map/000004.png"])
 def test_a_missing_file_splits_the_sequence(tmp_path, file):
     root = writers.write_plain(tmp_path)
     (root / "train/a" / file).unlink()
-    with pytest.warns(schema.DataWarning, match=f"1 of 10 frames are left out .*1 in {file.split('/')[0]}.* 2 gap-free"):
+    message = f"1 of 10 frames are left out .*1 in {file.split('/')[0]}.* 2 gap-free"
+    with pytest.warns(schema.DataWarning, match=message):
         recording = plain.PlainRecording(root)
     assert [(s.start, s.length) for s in recording.sequences if s.name == "train/a"] == [(0, 4), (5, 5)]
 
@@ -52,7 +54,9 @@ def test_a_restart_and_a_missing_line_split_the_sequence(tmp_path):
     root = writers.write_plain(tmp_path)
     rewrite_table(root, "train/a", lambda lines: [*lines[:4], lines[4].replace(",0,noon", ",1,noon"), *lines[5:]])
     rewrite_table(root, "val_rl/c", lambda lines: lines[:4] + lines[5:])
-    pieces = [(s.name, s.start, s.length) for s in plain.PlainRecording(root).sequences]
+    with pytest.warns(schema.DataWarning, match=r"val_rl/c: time jumps .* at 1 of 7 frames; .* 2 gap-free"):
+        recording = plain.PlainRecording(root)
+    pieces = [(s.name, s.start, s.length) for s in recording.sequences]
     assert pieces == [("train/a", 0, 4), ("train/a", 4, 6), ("train/b", 0, 6), ("val_rl/c", 0, 3), ("val_rl/c", 3, 4)]
 
 
@@ -90,7 +94,7 @@ def test_a_missing_section_is_named(tmp_path):
 
 
 @pytest.mark.parametrize(("change", "message"), [
-    (lambda lines: [line.replace("timestamp_s", "time") for line in lines], "column timestamp_s is missing; the header has"),
+    (lambda lines: [line.replace("timestamp_s", "time") for line in lines], "column timestamp_s is missing"),
     (lambda lines: [*lines[:3], lines[3].replace("0.2", "fast", 1), *lines[4:]], "line 4: timestamp_s is 'fast'"),
     (lambda lines: [*lines[:3], lines[3].replace("5.5", "nan"), *lines[4:]], "line 4: speed_mps is 'nan'"),
     (lambda lines: [lines[0], lines[2], lines[1], *lines[3:]], "line 3: time 0.000 s does not come after"),
@@ -112,7 +116,7 @@ def truncate(path):
     ("lidar/000000.npz", lambda path: np.savez(path, xyz=np.zeros(3)), "holds xyz, expected an array 'points_m'"),
     ("lidar/000000.npz", lambda path: np.savez(path, points_m=np.full((4, 3), np.nan)), "4 of 4 points are NaN"),
     ("lidar/000000.npz", lambda path: np.savez(path, points_m=np.zeros((4, 2))), r"shape \[4, 2\]"),
-    ("occupancy/000000.npz", lambda path: np.savez(path, occupancy=np.zeros((2, 2, 2))), r"shape \[2, 2, 2\].*16, 16, 16"),
+    ("occupancy/000000.npz", lambda path: np.savez(path, occupancy=np.zeros((2, 2, 2))), r"shape \[2, 2, 2\].*16, 16"),
     ("image/000000.png", lambda path: path.write_bytes((path.parent.parent / "route_map/000000.png").read_bytes()),
      r"000000.png: shape \[64, 64, 3\]"),
 ])
@@ -138,7 +142,7 @@ def test_folders_that_are_no_recording(tmp_path):
     with pytest.raises(schema.DataError, match="is empty"):
         sources.open_recording(tmp_path)
     (tmp_path / "holiday.jpg").touch()
-    with pytest.raises(schema.DataError, match="no known kind. Known are plain .*KITTI raw .*Found holiday.jpg"):
+    with pytest.raises(schema.DataError, match=r"no known kind. Known are plain .*KITTI raw .*Found holiday.jpg"):
         sources.open_recording(tmp_path)
     with pytest.raises(schema.DataError, match="is a file"):
         sources.open_recording(tmp_path / "holiday.jpg")

@@ -8,7 +8,8 @@ from muvo_jax.metrics import baselines
 
 
 def batch_of(windows=1, frames=2, **fields):
-    return types.Batch(action=np.zeros((windows, frames, 2), np.float32), is_first=np.zeros((windows, frames), bool), **fields)
+    return types.Batch(action=np.zeros((windows, frames, 2), np.float32), is_first=np.zeros((windows, frames), bool),
+                       **fields)
 
 
 def test_copy_last_repeats_the_last_observed_frame():
@@ -16,7 +17,8 @@ def test_copy_last_repeats_the_last_observed_frame():
     image[0, 1] = 51
     range_view = np.arange(12, dtype=np.float32).reshape(1, 3, 1, 1, 4)
     occupancy = np.array([[[0, 0, 0, 0], [1, 255, 0, 255], [1, 1, 1, 1]]], np.uint8).reshape(1, 3, 4, 1, 1)
-    copied, unknown = baselines.copy_last(batch_of(frames=3, image=image, range_view=range_view, occupancy=occupancy), 2, 4)
+    batch = batch_of(frames=3, image=image, range_view=range_view, occupancy=occupancy)
+    copied, unknown = baselines.copy_last(batch, 2, 4)
     assert copied["image"].shape == (1, 4, 2, 2, 3)
     np.testing.assert_allclose(copied["image"], 0.2, rtol=1e-6)
     np.testing.assert_array_equal(copied["range_view"][0, 3, 0, 0], [4, 5, 6, 7])

@@ -54,6 +54,7 @@ def test_parity_with_the_reference():
                          for name in ("cd_pred", "cd_tgt"))
     stream = streaming.StreamingMean.zeros(1)
     for clouds in (prediction, truth + np.float32(0.1)):
-        distances = [points.chamfer_m(a, b) for a, b in zip(clouds.reshape(4, 400, 3), truth.reshape(4, 400, 3), strict=True)]
+        frames = zip(clouds.reshape(4, 400, 3), truth.reshape(4, 400, 3), strict=True)
+        distances = [points.chamfer_m(*frame) for frame in frames]
         stream = stream.add(np.array(distances)[:, None])
     assert stream.overall() == pytest.approx(float(golden["metric_cd_1d_2batches"]), rel=1e-5)

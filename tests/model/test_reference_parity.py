@@ -1,7 +1,7 @@
 """The paper-size model against numbers of the authors' PyTorch code, on weights that both sides generate by one rule.
 
-Needs a folder of such numbers in the environment variable MUVO_GOLDEN (p3_modules_1d.npz, p4_full/1d_RV_WOB_TR_voxel.npz,
-packs.py, weights_rule.py and manifests/); skipped without it. Run with  pytest -m slow -s  to see the errors.
+Needs a folder of such numbers in the environment variable MUVO_GOLDEN (p3_modules_1d.npz, packs.py, weights_rule.py,
+p4_full/1d_RV_WOB_TR_voxel.npz and manifests/); skipped without it. Run with  pytest -m slow -s  to see the errors.
 """
 
 import functools
@@ -18,8 +18,9 @@ import pytest
 from muvo_jax import config as config_lib
 from muvo_jax.interop import names
 from muvo_jax.model import fusion, rollout, world_model
-from muvo_jax.nn import attention, norm
-from muvo_jax.types import Batch, LatentState, StepNoise
+from muvo_jax.nn import attention, layers, norm, resnet
+from muvo_jax.nn import pyramid as pyramid_lib
+from muvo_jax.types import Batch, StepNoise
 
 FOLDER = pathlib.Path(os.environ.get("MUVO_GOLDEN", "/nowhere"))
 pytestmark = [
@@ -94,8 +95,6 @@ def test_backbones_and_necks():
     range_view = channels_last(make_input("enc_rv", (1, 4, 64, 1024), "smooth_pm1"))
     pyramid = [channels_last(make_input(f"fpn{level}", (1, *shape), "smooth_pm1")) for level, shape in
                enumerate(((128, 40, 104), (256, 20, 52), (512, 10, 26)))]
-    from muvo_jax.nn import pyramid as pyramid_lib
-    from muvo_jax.nn import resnet
     params, stats = variables()["params"], variables()["batch_stats"]
 
     def run(module, part, sub, value):
@@ -134,7 +133,6 @@ def test_measurements():
     speed_mps = make_input("speed", (4, 1), "speed")[:, 0]
     route = channels_last(make_input("route", (2, 3, 64, 64), "smooth_pm1"))
     # The pack feeds a map that is normalised already, with three different channels: enter behind the normalisation.
-    from muvo_jax.nn import layers, resnet
     params, stats = variables()["params"]["route"], variables()["batch_stats"]["route"]
     (deepest,) = resnet.ResNet18(64, (4,)).apply({"params": params["backbone"], "batch_stats": stats["backbone"]},
                                                  route, EVAL)
@@ -168,13 +166,15 @@ def test_recurrent_model(sampled):
                                          jnp.asarray(is_first), noise)
     prefix = f"rssm_sample{int(sampled)}"
     out = {}
-    for kind, gaussian, drawn in (("prior", observed.prior, prior_noise), ("posterior", observed.posterior, posterior_noise)):
+    for kind, gaussian, drawn in (("prior", observed.prior, prior_noise),
+                                  ("posterior", observed.posterior, posterior_noise)):
         out |= {f"{prefix}/{kind}/hidden_state": observed.states.deterministic,
                 f"{prefix}/{kind}/mu": gaussian.mean, f"{prefix}/{kind}/sigma": gaussian.std,
                 f"{prefix}/{kind}/sample": gaussian.sample(drawn)}
     state, steps = observed.last, []
     for step in range(6):
-        state, prior = MODEL.imagine_step(variables(), jnp.asarray(draw(12 + step)), jnp.asarray(actions[:, 6 + step]), state)
+        state, prior = MODEL.imagine_step(variables(), jnp.asarray(draw(12 + step)),
+                                          jnp.asarray(actions[:, 6 + step]), state)
         steps.append((state.deterministic, state.stochastic, prior.mean, prior.std))
     for name, *values in zip(("hidden_state", "sample", "mu", "sigma"), *steps, strict=True):
         out[f"{prefix}/imagine/{name}"] = np.stack(values, 1)
@@ -191,7 +191,8 @@ def full_batch():
     image = make_input("full_image", (1, frames, 3, 600, 960), "image_u8")[..., 138:458, 64:896]
     route = make_input("full_route", (1, frames, 3, 192, 192), "route_u8")[:, :, 0, ::3, ::3]
     range_view = make_input("full_rv", (1, frames, 4, 64, 1024), "range_view")
-    action = np.concatenate([make_input(f"full_{name}", (1, frames + 3, 1), "pm1") for name in ("throttle", "steer")], -1)
+    action = np.concatenate([make_input(f"full_{name}", (1, frames + 3, 1), "pm1")
+                             for name in ("throttle", "steer")], -1)
     batch = Batch(action=action[:, :frames], is_first=np.arange(frames)[None] == 0,
                   image=np.ascontiguousarray(np.moveaxis(image, 2, -1)), range_view=np.moveaxis(range_view, 2, -1),
                   route_map=route, speed_mps=make_input("full_speed", (1, frames, 1), "speed")[..., 0])
@@ -224,12 +225,3 @@ def test_full_model():
                 f"{name}/state": dream.features, f"{name}/action": dream.actions}
         out |= head_entries(name, rollout.decode(MODEL, variables(), dream.states))
     check(P4, out, {"voxel": 1e-3})
-
-
-def test_stepping_state_of_a_live_vehicle():
-    """The reference's deployment output is the action head on the last filtered state, in mean mode."""
-    batch, _ = full_batch()
-    observed = rollout.observe(MODEL, variables(), jax.random.key(0), batch, sampled=False)
-    state = LatentState(observed.last.deterministic, observed.last.stochastic)
-    action = rollout.decode(MODEL, variables(), state, ("action",))["action"][1][:, None]
-    check(P4, {"deployment/throttle_brake": action[..., :1], "deployment/steering": action[..., 1:]}, {})

@@ -54,8 +54,8 @@ def test_grids_of_one_kind_stay_finite(value, margin):
 
 
 def test_no_ratio_without_denominator():
-    # All empty, p = 0.3: class empty has precision 1 and recall 0.7, no specificity; "not empty" has specificity 0.7 and
-    # precision 0, whose logarithm is held at -100.
+    # All empty, p = 0.3: class empty has precision 1 and recall 0.7, no specificity; "not empty" has specificity 0.7
+    # and precision 0, whose logarithm is held at -100.
     sums = scal.occupancy_sums(logits_of([0.3, 0.3]), jnp.zeros(2, jnp.uint8))
     np.testing.assert_allclose(scal.semantic_scal(sums), -np.log(0.7), rtol=1e-5)
     np.testing.assert_allclose(scal.geometric_scal(sums), 100.0 - np.log(0.7), rtol=1e-5)

@@ -54,7 +54,8 @@ def torch_adamw(parameter, gradients, decay, total_steps):
 
 def test_updates_match_torch_with_cycled_momentum_and_two_groups():
     generator = np.random.default_rng(0)
-    params = {"kernel": generator.normal(size=(3, 4)), "bias": generator.normal(size=4), "scalar": generator.normal(size=())}
+    shapes = {"kernel": (3, 4), "bias": (4,), "scalar": ()}
+    params = {name: generator.normal(size=shape) for name, shape in shapes.items()}
     gradients = [{name: generator.normal(size=value.shape) for name, value in params.items()} for _ in range(6)]
     optimizer = optimizer_lib.make_optimizer(CONFIG, 10)
     ours = jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float32), params)
@@ -80,5 +81,6 @@ def test_clipping_limits_the_global_norm():
     for clip_norm, expected in ((0.0, 25.0), (1.0, 1.0)):
         optimizer = optimizer_lib.make_optimizer(dataclasses.replace(CONFIG, clip_norm=clip_norm), 10)
         _, state = optimizer.update(gradient, optimizer.init(gradient), gradient)
-        moments = [leaf for path, leaf in jax.tree_util.tree_leaves_with_path(state) if "nu" in jax.tree_util.keystr(path)]
+        moments = [leaf for path, leaf in jax.tree_util.tree_leaves_with_path(state)
+                   if "nu" in jax.tree_util.keystr(path)]
         np.testing.assert_allclose(sum(moment.sum() for moment in moments), expected * (1 - CONFIG.beta2), rtol=1e-3)

@@ -12,8 +12,8 @@ MATERIALS = ("wall", "roof", "trunk", "leaves", "pole", "lamp", "car_body", "car
 WALL, ROOF, TRUNK, LEAVES, POLE, LAMP, CAR_BODY, CAR_CABIN, SHADOW, PERSON, HEAD, HEDGE = range(len(MATERIALS))
 CLASSES = ("sky", "road", "marking", "pavement", "grass", "building", "vegetation", "pole", "vehicle", "pedestrian")
 SKY, ROAD, MARKING, PAVEMENT, GRASS, BUILDING, VEGETATION, POLE_CLASS, VEHICLE, PEDESTRIAN = range(len(CLASSES))
-CLASS_OF_MATERIAL = np.array([BUILDING, BUILDING, VEGETATION, VEGETATION, POLE_CLASS, POLE_CLASS, VEHICLE, VEHICLE, ROAD,
-                              PEDESTRIAN, PEDESTRIAN, VEGETATION], np.uint8)
+CLASS_OF_MATERIAL = np.array([BUILDING, BUILDING, VEGETATION, VEGETATION, POLE_CLASS, POLE_CLASS, VEHICLE, VEHICLE,
+                              ROAD, PEDESTRIAN, PEDESTRIAN, VEGETATION], np.uint8)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -90,9 +90,8 @@ def _paint_street(distance_m: np.ndarray, marked: np.ndarray, origin_m: np.ndarr
     low = np.floor((np.minimum(start, end) - 10 - origin_m) / CELL_M).astype(int)
     high = np.ceil((np.maximum(start, end) + 10 - origin_m) / CELL_M).astype(int)
     window = (slice(low[0], high[0]), slice(low[1], high[1]))
-    x, y = ((np.arange(low[axis], high[axis], dtype=np.float32) + 0.5) * CELL_M + np.float32(origin_m[axis] - start[axis])
-            for axis in range(2))
-    x, y = x[:, None], y[None, :]
+    x, y = ((np.arange(low[axis], high[axis]) + 0.5) * CELL_M + origin_m[axis] - start[axis] for axis in range(2))
+    x, y = x[:, None].astype(np.float32), y[None, :].astype(np.float32)
     along = (x * forward[0] + y * forward[1]).astype(np.float32)
     across = (y * forward[0] - x * forward[1]).astype(np.float32)
     beyond = np.maximum(np.maximum(-along, along - length), 0)

@@ -1,8 +1,8 @@
 """Ray casting for level sensors among upright boxes, on the CPU, fast enough for recordings made while one waits.
 
 Neither sensor rolls or pitches, so all pixels of a column lie in one vertical half-plane. There a box is an interval of
-horizontal distance and an interval of height: the expensive part, cutting footprints, is done per (column, box) pair, and
-a pixel needs only a handful of comparisons per box that its column really crosses.
+horizontal distance and an interval of height: the expensive part, cutting footprints, is done per (column, box) pair,
+and a pixel needs only a handful of comparisons per box that its column really crosses.
 """
 
 from __future__ import annotations

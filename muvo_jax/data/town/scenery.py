@@ -110,7 +110,8 @@ def _parked_cars(side: _Side, share: float, rng: np.random.Generator) -> list[bo
     slot_m = np.arange(17.0, side.length - 17, 6.4)
     slot_m = slot_m[rng.random(len(slot_m)) < share]
     count = len(slot_m)
-    centre_m = side.place(slot_m + rng.uniform(-0.4, 0.4, count), map_lib.PARKING_OFFSET_M + rng.uniform(-.1, .1, count))
+    centre_m = side.place(slot_m + rng.uniform(-0.4, 0.4, count),
+                          map_lib.PARKING_OFFSET_M + rng.uniform(-0.1, 0.1, count))
     return [box_lib.cars(centre_m, side.yaw_rad + rng.normal(0, 0.015, count), rng.uniform(4.0, 4.8, count),
                          box_lib.CAR_COLOURS[rng.integers(0, len(box_lib.CAR_COLOURS), count)],
                          rng.random(count) < 0.15)]

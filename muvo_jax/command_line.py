@@ -1,0 +1,103 @@
+"""What the commands share: one clear line for an expected error, the compilation cache, and opening the data."""
+
+from __future__ import annotations
+
+import json
+import os
+import pathlib
+import sys
+import time
+import traceback
+import warnings
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any, TypeVar
+
+import jax
+import tyro
+
+from muvo_jax import config as config_lib
+from muvo_jax.data import schema, sources
+from muvo_jax.data.town import record
+from muvo_jax.training import screen
+
+TRACEBACK_VARIABLE = "MUVO_JAX_TRACEBACK"
+EXPECTED_ERRORS = (ValueError, OSError, ArithmeticError)  # DataError, CheckpointError and NonFiniteLossError are these
+_Options = TypeVar("_Options")
+
+
+def run(options_type: type[_Options], work: Callable[[_Options, screen.Screen], None], *, program: str,
+        arguments: Sequence[str] | None = None) -> int:
+    """Parses the command line and does the work.
+
+    Returns:
+      The exit code: 0 done, 1 an error that was explained, 130 interrupted. A wrong command line raises SystemExit(2).
+    """
+    options = tyro.cli(options_type, prog=f"python -m muvo_jax.{program}", args=arguments)
+    show = screen.Screen()
+    with warnings.catch_warnings():
+        warnings.showwarning = lambda message, *_, **__: show.warn(str(message))
+        use_compilation_cache()
+        try:
+            work(options, show)
+        except EXPECTED_ERRORS as error:
+            show.stop()
+            if os.environ.get(TRACEBACK_VARIABLE):
+                traceback.print_exc()
+            print(f"error: {error}", file=sys.stderr)
+            if not os.environ.get(TRACEBACK_VARIABLE):
+                print(f"({type(error).__name__}; {TRACEBACK_VARIABLE}=1 shows where)", file=sys.stderr)
+            return 1
+        except KeyboardInterrupt:
+            show.stop()
+            print("interrupted.", file=sys.stderr)
+            return 130
+    return 0
+
+
+def use_compilation_cache() -> None:
+    """Keeps compiled programs in the user's cache folder, unless JAX_COMPILATION_CACHE_DIR says where."""
+    if not os.environ.get("JAX_COMPILATION_CACHE_DIR"):
+        jax.config.update("jax_compilation_cache_dir", str(cache_folder() / "jax"))
+
+
+def cache_folder() -> pathlib.Path:
+    """$XDG_CACHE_HOME/muvo_jax, or ~/.cache/muvo_jax."""
+    base = os.environ.get("XDG_CACHE_HOME") or pathlib.Path.home() / ".cache"
+    return pathlib.Path(base) / "muvo_jax"
+
+
+def process_start_s() -> float:
+    """When this process began, on the clock of time.perf_counter (where the system does not say: now)."""
+    try:
+        ticks = int(pathlib.Path("/proc/self/stat").read_text(encoding="utf-8").rpartition(")")[2].split()[19])
+        age_s = time.clock_gettime(time.CLOCK_BOOTTIME) - ticks / os.sysconf("SC_CLK_TCK")
+    except (OSError, ValueError, AttributeError):
+        age_s = 0.0
+    return time.perf_counter() - age_s
+
+
+def parse_settings(settings: Iterable[str]) -> dict[str, Any]:
+    """{"model.dropout": 0.0} from ["model.dropout=0.0"]; a value that is not JSON is text.
+
+    Raises:
+      ValueError: where there is no "=".
+    """
+    parsed = {}
+    for setting in settings:
+        name, equals, text = setting.partition("=")
+        if not equals:
+            raise ValueError(f"--set: got {setting!r}, expected name=value, such as --set model.dropout=0.0")
+        try:
+            parsed[name] = json.loads(text)
+        except json.JSONDecodeError:
+            parsed[name] = text
+    return parsed
+
+
+def open_data(config: config_lib.Config, show: screen.Screen) -> schema.Recording:
+    """The recording that a config names; the built-in town is recorded first where it is not in the cache."""
+    if config.data.path == "town":
+        with show.counter("recording the built-in town", "frames") as progress:
+            folder = record.cached_town(config, progress)
+        return sources.open_recording(folder)
+    return sources.open_recording(config.data.path)

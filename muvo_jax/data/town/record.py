@@ -1,0 +1,221 @@
+"""Records the town: rollouts of the expert in the plain format, made once and kept in the user's cache.
+
+Runs are independent of each other, so worker processes share them. A worker is this module run as a program: unlike a
+forked or spawned process it touches neither the devices nor the main module of whoever asked for the recording.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import hashlib
+import json
+import os
+import pathlib
+import subprocess
+import sys
+import tempfile
+from collections.abc import Callable, Iterator
+from typing import NamedTuple
+
+from muvo_jax import config as config_lib
+from muvo_jax.data import recorder, schema
+from muvo_jax.data.town import settings
+from muvo_jax.data.town.simulator import WEATHER_NAMES, Town
+from muvo_jax.ops import camera as camera_ops
+
+try:
+    import fcntl
+except ImportError:  # Windows: two recordings at once are then up to the user
+    fcntl = None
+
+# Raised by whatever changes the bytes of a recording, so that old caches are not taken for new ones.
+RECORDING_VERSION = 1
+COMPLETE_FILE = "complete.json"
+# Frames before the first recorded one: the expert has settled and traffic has spread.
+WARM_UP_FRAMES = 20
+# Below this many frames a worker process costs more time than it saves.
+WORKER_FRAMES = 200
+
+REPORT_FRAMES = 10
+
+Progress = Callable[[int, int], None]
+
+
+class Job(NamedTuple):
+    """One run to record."""
+
+    split: str
+    run: str
+    seed: int
+    weather: str
+    frames: int
+
+
+def jobs(size: str) -> list[Job]:
+    """All runs of a size, in the order of splits.
+
+    Raises:
+      ValueError: for a size that does not exist.
+    """
+    if size not in settings.SIZES:
+        raise ValueError(f"town size {size!r} is unknown; known are {', '.join(settings.SIZES)}.")
+    return [Job(split, f"{index:03d}_{plan.weathers[index % len(plan.weathers)]}", plan.first_seed + index,
+                plan.weathers[index % len(plan.weathers)], plan.frames)
+            for split, plan in settings.SIZES[size].items() for index in range(plan.runs)]
+
+
+def cached_town(config: config_lib.Config, progress: Progress | None = None) -> pathlib.Path:
+    """Returns the folder of the recording that `config` asks for, recording what is missing of it first.
+
+    It lies in $XDG_CACHE_HOME (or ~/.cache) under muvo_jax/town-<hash of everything that decides its content>.
+
+    Args:
+      config: data.town_size, data.town_seed, the model's sensors and the action contract are used.
+      progress: called with (frames done, frames in all) now and then.
+    """
+    town_config = settings.from_config(config)
+    cache = pathlib.Path(os.environ.get("XDG_CACHE_HOME") or pathlib.Path.home() / ".cache")
+    directory = cache / "muvo_jax" / f"town-{fingerprint(town_config, config.data.town_size)}"
+    if not (directory / COMPLETE_FILE).is_file():
+        record_town(directory, town_config, config.data.town_size, progress=progress)
+    return directory
+
+
+def fingerprint(town_config: settings.TownConfig, size: str) -> str:
+    """Names everything that decides the bytes of a recording: town, splits, weathers and version."""
+    splits = {name: dataclasses.asdict(split) for name, split in settings.SIZES[size].items()}
+    weathers = {name: dataclasses.asdict(weather) for name, weather in settings.WEATHERS.items()}
+    content = json.dumps([RECORDING_VERSION, WARM_UP_FRAMES, dataclasses.asdict(town_config), splits, weathers],
+                         sort_keys=True)
+    return f"{size}-{hashlib.sha256(content.encode()).hexdigest()[:12]}"
+
+
+def record_town(directory: pathlib.Path | str, town_config: settings.TownConfig, size: str = "default", *,
+                progress: Progress | None = None, workers: int | None = None) -> pathlib.Path:
+    """Records all splits of a size into `directory`; complete runs that are there already are kept.
+
+    Args:
+      workers: processes; by default one for each processor, none for small recordings.
+
+    Raises:
+      ValueError: for a size that does not exist.
+      FileExistsError: where the directory holds a recording of other settings.
+      RuntimeError: where a worker failed; its message is included.
+    """
+    directory = pathlib.Path(directory)
+    planned = jobs(size)
+    describe(directory, town_config, tuple(settings.SIZES[size]))
+    with _locked(directory):
+        missing = [job for job in planned if not recorder.is_complete(directory, job.split, job.run)]
+        total = sum(job.frames for job in planned)
+        done = total - sum(job.frames for job in missing)
+        if workers is None:
+            workers = min(os.cpu_count() or 1, (total - done) // WORKER_FRAMES)
+        frames = (_record_here(directory, town_config, missing) if workers < 1
+                  else _record_in_workers(directory, town_config, missing, workers))
+        for count in frames:
+            done += count
+            if progress is not None:
+                progress(done, total)
+        recorder.write_atomically(directory / COMPLETE_FILE,
+                                  json.dumps({"frames": total, "version": RECORDING_VERSION}))
+    return directory
+
+
+def describe(directory: pathlib.Path, town_config: settings.TownConfig, splits: tuple[str, ...]) -> None:
+    """Writes the recording's description."""
+    intrinsics = camera_ops.intrinsics_from_fov(town_config.camera_width_px, town_config.camera_height_px,
+                                                town_config.camera_fov_rad)
+    pose = camera_ops.level_camera_to_ego(town_config.lidar.position_m)
+    camera = schema.Camera(town_config.camera_width_px, town_config.camera_height_px,
+                           tuple(map(tuple, intrinsics.tolist())), tuple(map(tuple, pose.tolist())))
+    recorder.write_description(directory, name="town", rate_hz=town_config.contract.rate_hz, splits=splits,
+                               contract=town_config.contract, camera=camera, lidar=town_config.lidar,
+                               voxels=town_config.voxels)
+
+
+def record_run(directory: pathlib.Path, town: Town, job: Job) -> Iterator[int]:
+    """Records one run, yielding 1 after each frame. A drive that ends early ends the run early."""
+    writer = recorder.RunWriter(directory, job.split, job.run)
+    state = town.reset(job.seed, job.weather)
+    for _ in range(WARM_UP_FRAMES):
+        state = town.step(state, town.expert(state))
+    for frame in range(job.frames):
+        seen = town.render(state)
+        action = town.expert(state)
+        x_m, y_m, yaw_rad = state.pose
+        writer.write({**seen, "occupancy": town.occupancy(seen), "frame_id": frame,
+                      "timestamp_s": round(frame / town.config.contract.rate_hz, 6), "x_m": x_m, "y_m": y_m,
+                      "yaw_rad": yaw_rad, "acceleration": action[0], "steering": action[1],
+                      "weather": WEATHER_NAMES[int(state.weather)]})
+        yield 1
+        if seen["is_terminal"]:
+            break
+        state = town.step(state, action)
+    writer.close()
+
+
+def _record_here(directory: pathlib.Path, town_config: settings.TownConfig, missing: list[Job]) -> Iterator[int]:
+    if missing:
+        town = Town(town_config)
+        for job in missing:
+            yield from record_run(directory, town, job)
+
+
+def _record_in_workers(directory: pathlib.Path, town_config: settings.TownConfig, missing: list[Job],
+                       workers: int) -> Iterator[int]:
+    """Deals the runs out to worker processes and yields the frames they report, a few at a time."""
+    environment = {**os.environ, "JAX_PLATFORMS": "cpu", "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
+    root = str(pathlib.Path(__file__).parents[3])
+    environment["PYTHONPATH"] = os.pathsep.join(filter(None, [root, os.environ.get("PYTHONPATH")]))
+    reports, report_end = os.pipe()
+    processes = []
+    with os.fdopen(reports) as lines, tempfile.TemporaryFile("w+") as errors:
+        try:
+            for index in range(workers):
+                process = subprocess.Popen([sys.executable, "-m", "muvo_jax.data.town.record"], stdin=subprocess.PIPE,
+                                           stdout=report_end, stderr=errors, text=True, env=environment)
+                processes.append(process)
+                json.dump({"directory": str(directory), "town": dataclasses.asdict(town_config),
+                           "jobs": missing[index::workers]}, process.stdin)
+                process.stdin.close()
+        finally:
+            os.close(report_end)
+        try:
+            for line in lines:
+                yield int(line)
+            failed = [process.wait() for process in processes]
+        finally:
+            for process in processes:
+                process.terminate()
+                process.wait()
+        if any(failed):
+            errors.seek(0)
+            raise RuntimeError(f"recording the town into {directory} failed (exit codes {failed}):\n"
+                               f"{errors.read()[-2000:]}")
+
+
+@contextlib.contextmanager
+def _locked(directory: pathlib.Path) -> Iterator[None]:
+    """Lets one process at a time record into a directory; the lock ends with the process, however it ends."""
+    with (directory / ".lock").open("w") as lock:
+        if fcntl is not None:
+            fcntl.flock(lock, fcntl.LOCK_EX)
+        yield
+
+
+def _work() -> None:
+    """What a worker does: reads its order from standard input and prints a line with the frames since the last one."""
+    order = json.load(sys.stdin)
+    town = Town(config_lib.parse(settings.TownConfig, order["town"], "town"))
+    for job in order["jobs"]:
+        frames = 0
+        for frames, _ in enumerate(record_run(pathlib.Path(order["directory"]), town, Job(*job)), start=1):
+            if frames % REPORT_FRAMES == 0:
+                print(REPORT_FRAMES, flush=True)
+        print(Job(*job).frames - frames // REPORT_FRAMES * REPORT_FRAMES, flush=True)
+
+
+if __name__ == "__main__":
+    _work()

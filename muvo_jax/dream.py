@@ -1,0 +1,147 @@
+"""python -m muvo_jax.dream RUN: watch a trained model observe, then imagine, beside what really happened."""
+
+from __future__ import annotations
+
+import dataclasses
+import pathlib
+import sys
+from typing import Annotated
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import tyro
+
+from muvo_jax import command_line, evaluate, types
+from muvo_jax import config as config_lib
+from muvo_jax.data import pipeline, schema, windows
+from muvo_jax.data import prepare as prepare_lib
+from muvo_jax.metrics import protocol
+from muvo_jax.model import rollout, world_model
+from muvo_jax.training import checkpoint, screen
+from muvo_jax.viz import sheets
+
+MOST_COLUMNS = 3  # predictions beside the truth in one animation
+
+
+@dataclasses.dataclass(frozen=True)
+class Options:
+    """Observes the first frames of a recorded sequence, imagines the rest under its actions, and draws both.
+
+    Writes an animation (GIF) and two sheets (PNG): camera and range image; points and voxels in space.
+
+    Examples:
+      python -m muvo_jax.dream runs/town-tr
+      python -m muvo_jax.dream runs/town-tr --split=val_ds --start=30 --horizon=12
+      python -m muvo_jax.dream runs/town-tr --branches=3                    (three sampled futures)
+    """
+
+    run: Annotated[pathlib.Path, tyro.conf.Positional]
+    """The run's folder."""
+    checkpoint: str = "latest"
+    """latest, best (validation loss) or a step."""
+    data: str | None = None
+    """Another recording than the one that the run was trained on."""
+    split: str | None = None
+    """By default the first validation split."""
+    sequence: str | None = None
+    """Name of the recorded run; by default the longest of the split."""
+    start: int | None = None
+    """First frame to observe, counted from the sequence's start; by default such that the window lies in its middle."""
+    context: int | None = None
+    """Frames to observe."""
+    horizon: int | None = None
+    """Frames to imagine."""
+    branches: int = 1
+    """Futures to sample; 1 takes the mean of each latent."""
+    seed: int = 0
+    """Of the sampled futures."""
+    out: pathlib.Path | None = None
+    """Where to write; by default RUN/dreams."""
+
+
+def dream(options: Options, show: screen.Screen) -> list[pathlib.Path]:
+    """Does what the command line asks for; returns the files written."""
+    loaded = checkpoint.load_run(options.run, evaluate.which(options.checkpoint))
+    for text in loaded.warnings:
+        show.warn(text)
+    config = loaded.config
+    if options.branches < 1:
+        raise ValueError(f"--branches is {options.branches}; it must be at least 1.")
+    fields = {"data": "data.path", "context": "data.context", "horizon": "data.horizon"}
+    chosen = {field: getattr(options, flag) for flag, field in fields.items() if getattr(options, flag) is not None}
+    for field, value in chosen.items():
+        config = config_lib.override(config, field, value)
+    recording = command_line.open_data(config, show)
+    config = evaluate.fit(config, recording, tuple(chosen))
+    window = choose_window(recording, config, options)
+    batch = pipeline.Frames(recording, config).batch([window])
+    futures = dream_window(loaded.model, loaded.variables, jax.random.key(options.seed), batch,
+                           context=config.data.context, horizon=config.data.horizon, branches=options.branches)
+    labels = ["world model"] if options.branches == 1 else [f"future {index + 1}" for index in range(len(futures))]
+    views = {label: sheets.views_of_frames(frames, 0)
+             for label, frames in zip(labels[:MOST_COLUMNS], futures[:MOST_COLUMNS], strict=True)}
+    sequence = window.sequence
+    title = f"{config.model.variant} step {loaded.step}   {sequence.split} / {sequence.name} from frame {window.start}"
+    written = sheets.write_dream(
+        options.out or loaded.folder / "dreams", sheets.views_of_batch(batch, 0), views, np.asarray(batch.action[0]),
+        sheets.Scene.of(config), context=config.data.context, title=title,
+        name=f"{sequence.split}_{sequence.name.replace('/', '-')}_{window.start:04d}")
+    for path in written:
+        show.line(f"wrote {path}")
+    return written
+
+
+def choose_window(recording: schema.Recording, config: config_lib.Config, options: Options) -> windows.Window:
+    """The frames to dream about.
+
+    Raises:
+      ValueError: for a split, sequence or start that the recording does not have, naming what it has.
+    """
+    description, data = recording.description, config.data
+    split = options.split or next((name for name in description.splits if name != "train"), description.splits[0])
+    if split not in description.splits:
+        raise ValueError(f"--split: {description.name!r} has no split {split!r}; it has "
+                         f"{', '.join(description.splits)}.")
+    sequences = [sequence for sequence in recording.sequences if sequence.split == split]
+    named = [sequence for sequence in sequences if options.sequence in (None, sequence.name)]
+    if not named:
+        known = ", ".join(sorted({sequence.name for sequence in sequences})[:12])
+        raise ValueError(f"--sequence: split {split!r} has no {options.sequence!r}; it has {known}.")
+    sequence = max(named, key=lambda candidate: candidate.length)
+    frames = data.context + data.horizon
+    last = sequence.length - prepare_lib.span(frames, data.stride)
+    start = max(last, 0) // 2 if options.start is None else options.start
+    if not 0 <= start <= last:
+        raise ValueError(f"--start {start}: sequence {sequence.name!r} has {sequence.length} frames; {frames} frames, "
+                         f"{data.stride} apart, fit when they start between 0 and {last}.")
+    return windows.Window(sequence, start, frames, data.stride)
+
+
+def dream_window(model: world_model.WorldModel, variables: types.Variables, key: types.Array, batch: types.Batch, *,
+                 context: int, horizon: int, branches: int) -> list[dict[str, np.ndarray]]:
+    """Frames [B, context + horizon, ...] of each future: the mean one, or `branches` sampled ones."""
+    sampled = branches > 1
+    heads = tuple(head for head in protocol.HEADS if head in model.config.heads)
+    observed = rollout.observe(model, variables, key, batch.time_slice(0, context), sampled=False)
+    actions = jnp.asarray(batch.action)[:, context - 1 : context + horizon - 1]
+    imagined = rollout.imagine(model, variables, key, observed.last, actions, branches=branches, sampled=sampled)
+    futures = []
+    for branch in range(branches):
+        states = jax.tree.map(lambda seen, dreamt, branch=branch: jnp.concatenate([seen, dreamt[:, branch]], axis=1),
+                              observed.states, imagined.states)
+        decoded = rollout.decode(model, variables, states, heads)
+        futures.append(jax.device_get(protocol.finish({head: scales[1] for head, scales in decoded.items()})))
+    return futures
+
+
+def _command(options: Options, show: screen.Screen) -> None:
+    dream(options, show)
+
+
+def main() -> int:
+    return command_line.run(Options, _command, program="dream")
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,232 @@
+"""python -m muvo_jax.evaluate RUN: judge a trained model beside copy-last and the training mean."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+import pathlib
+import sys
+from collections.abc import Mapping
+from typing import Annotated, Any
+
+import jax
+import rich.table
+import tyro
+
+from muvo_jax import command_line
+from muvo_jax import config as config_lib
+from muvo_jax.data import pipeline, prepare
+from muvo_jax.metrics import protocol
+from muvo_jax.training import checkpoint, screen, validation
+
+# metric -> (label, decimals, whether higher is better)
+METRICS = {
+    "psnr_db": ("PSNR [dB]", 2, True), "chamfer_m": ("Chamfer [m]", 3, False),
+    "iou_occ_observed": ("IoU+, unknown ignored", 4, True), "iou_occ_all": ("IoU+, unknown empty", 4, True),
+    "iou_empty_observed": ("IoU-, unknown ignored", 4, True), "iou_empty_all": ("IoU-, unknown empty", 4, True),
+    "precision_observed": ("precision", 4, True), "recall_observed": ("recall", 4, True),
+    "precision_all": ("precision, unknown empty", 4, True), "recall_all": ("recall, unknown empty", 4, True),
+}
+SOURCES = {"model": "model", "copy_last": "copy-last", "training_mean": "training mean"}
+
+
+@dataclasses.dataclass(frozen=True)
+class Options:
+    """Judges a run on every split: frames that it observed and frames that it imagined, beside two baselines.
+
+    Prints tables and writes RUN/evaluation.json and RUN/report.md.
+
+    Examples:
+      python -m muvo_jax.evaluate runs/town-tr
+      python -m muvo_jax.evaluate runs/town-tr --splits val_ds --windows=0      (all windows)
+      python -m muvo_jax.evaluate runs/town-tr --context=8 --horizon=10 --checkpoint=best
+    """
+
+    run: Annotated[pathlib.Path, tyro.conf.Positional]
+    """The run's folder."""
+    checkpoint: str = "latest"
+    """latest, best (validation loss) or a step."""
+    splits: tuple[str, ...] = ()
+    """Which ones; by default all, validation first."""
+    data: str | None = None
+    """Another recording than the one that the run was trained on."""
+    context: int | None = None
+    """Frames to observe."""
+    horizon: int | None = None
+    """Frames to imagine."""
+    windows: int | None = None
+    """At most so many windows of a split, evenly spread; 0 for all."""
+    batch: int | None = None
+    """Windows at a time."""
+    chamfer_points: int | None = None
+    """Points of each frame that the Chamfer distance looks at; 0 for all."""
+    sampled: bool | None = None
+    """Draw the latents instead of taking their means."""
+
+
+def evaluate(options: Options, show: screen.Screen) -> dict[str, Any]:
+    """Does what the command line asks for; returns what evaluation.json holds."""
+    loaded = checkpoint.load_run(options.run, which(options.checkpoint))
+    for text in loaded.warnings:
+        show.warn(text)
+    config = loaded.config
+    fields = {"data": "data.path", "context": "data.context", "horizon": "data.horizon",
+              "windows": "evaluation.windows", "batch": "evaluation.batch",
+              "chamfer_points": "evaluation.chamfer_points", "sampled": "evaluation.sampled"}
+    chosen = {field: getattr(options, flag) for flag, field in fields.items() if getattr(options, flag) is not None}
+    for field, value in chosen.items():
+        config = config_lib.override(config, field, value)
+    recording = command_line.open_data(config, show)
+    config = fit(config, recording, tuple(chosen))
+    frames = pipeline.Frames(recording, config)
+    splits = options.splits or tuple(sorted(recording.description.splits, key=lambda split: split == "train"))
+    mean, mean_frames = validation.training_mean(frames) if "train" in recording.description.splits else ({}, 0)
+    report: dict[str, Any] = {
+        "run": str(loaded.folder), "variant": config.model.variant, "step": loaded.step,
+        "parameters": sum(leaf.size for leaf in jax.tree.leaves(loaded.variables["params"])),
+        "data": {"name": recording.description.name, "path": config.data.path}, "protocol": protocol.identity(config),
+        "training_mean_frames": mean_frames, "packages": checkpoint.package_versions(), "splits": {}}
+    for split in splits:
+        show.line(f"evaluating {split} ...", style="dim")
+        scores = protocol.evaluate(loaded.model, loaded.variables,
+                                   validation.windows(frames, split, config.evaluation.windows), config, mean)
+        report["splits"][split] = scores
+        for phase in protocol.PHASES:
+            show.console.print(screen_table(split, phase, scores))
+    write_report(loaded.folder, report)
+    show.line(f"wrote {loaded.folder / 'evaluation.json'} and {loaded.folder / 'report.md'}")
+    return report
+
+
+def which(text: str) -> str | int:
+    """"latest", "best" or a step."""
+    if text in ("latest", "best"):
+        return text
+    if text.isdigit():
+        return int(text)
+    raise ValueError(f"--checkpoint: got {text!r}, expected latest, best or a step such as 400.")
+
+
+def fit(config: config_lib.Config, recording, chosen: tuple[str, ...]) -> config_lib.Config:
+    """The config fitted to a recording, whose sensors must be those that the model was trained with.
+
+    Raises:
+      ValueError: naming both where the recording asks for another network.
+    """
+    fitted = prepare.adapt(config, recording, keep=chosen).config
+    where = f"recording {recording.description.name!r} asks for another model than this run, which"
+    checkpoint.check_architecture(fitted, config, where)
+    return fitted
+
+
+def screen_table(split: str, phase: str, scores: Mapping[str, Any]) -> rich.table.Table:
+    """One split and phase: a row for each metric, the best source bold."""
+    phase_scores = scores[phase]
+    table = rich.table.Table(title=f"{split}: {phase} frames, {scores['windows']} windows", title_justify="left")
+    table.add_column("metric")
+    for source in phase_scores:
+        table.add_column(SOURCES[source], justify="right")
+    if phase == "imagined":
+        steps = max(len(metric["per_step"]) for metric in phase_scores["model"].values())
+        for source in phase_scores:
+            table.add_column(f"{SOURCES[source]}, step {steps}", justify="right")
+    table.add_column("undefined", justify="right")
+    for name, (label, decimals, higher) in METRICS.items():
+        if name not in phase_scores["model"]:
+            continue
+        means = {source: metrics[name]["mean"] for source, metrics in phase_scores.items() if name in metrics}
+        cells = marked(means, phase_scores, decimals, higher, "[bold]{}[/bold]")
+        if phase == "imagined":
+            last = {source: metrics[name]["per_step"][-1]
+                    for source, metrics in phase_scores.items() if name in metrics}
+            cells += marked(last, phase_scores, decimals, higher, "[bold]{}[/bold]")
+        undefined = [str(metrics[name].get("undefined", "")) for metrics in phase_scores.values() if name in metrics]
+        table.add_row(label, *cells, " / ".join(part for part in undefined if part))
+    return table
+
+
+def marked(values: Mapping[str, float], sources: Mapping[str, Any], decimals: int, higher: bool,
+           mark: str) -> list[str]:
+    """The values as text, the best one marked; NaN stays nan, a source without the metric is empty."""
+    defined = [value for value in values.values() if not math.isnan(value)]
+    best = (max if higher else min)(defined) if defined else None
+    cells = []
+    for source in sources:
+        text = "" if source not in values else number(values[source], decimals)
+        cells.append(mark.format(text) if text and values[source] == best else text)
+    return cells
+
+
+def number(value: float, decimals: int) -> str:
+    return "nan" if math.isnan(value) else f"{value:.{decimals}f}"
+
+
+def write_report(folder: pathlib.Path, report: Mapping[str, Any]) -> None:
+    """RUN/evaluation.json (not-a-number as the string "nan") and RUN/report.md."""
+    (folder / "evaluation.json").write_text(json.dumps(json_ready(report), indent=1) + "\n", encoding="utf-8")
+    (folder / "report.md").write_text(markdown(report), encoding="utf-8")
+
+
+def json_ready(value):
+    """Strict JSON: floats that are not finite become strings."""
+    if isinstance(value, Mapping):
+        return {name: json_ready(item) for name, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [json_ready(item) for item in value]
+    return str(value) if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def markdown(report: Mapping[str, Any]) -> str:
+    """The report as a page: for each split the averages and every step of the horizon."""
+    lines = [f"# {pathlib.Path(report['run']).name}", "",
+             f"{report['variant']}, {report['parameters']:,} parameters, step {report['step']}, trained and judged on "
+             f"{report['data']['name']}.", "", f"Protocol: {report['protocol']}. Training mean of "
+             f"{report['training_mean_frames']} frames. Bold is best. Chamfer and PSNR are means over frames; voxel "
+             f"scores come from counts over the whole split.", ""]
+    for split, scores in report["splits"].items():
+        lines += [f"## {split} ({scores['windows']} windows)", ""]
+        for phase in protocol.PHASES:
+            lines += [f"### {phase} frames", "", *_average_table(scores[phase]), ""]
+        lines += ["### imagined frames, step by step", "", *_step_table(scores["imagined"]), "",
+                  f"Copy-last copied {scores['copy_last_unknown_voxels']} unknown voxels as empty.", ""]
+    return "\n".join(lines)
+
+
+def _average_table(phase_scores: Mapping[str, Any]) -> list[str]:
+    lines = ["| metric | " + " | ".join(SOURCES[source] for source in phase_scores) + " | frames (undefined) |",
+             "|---|" + "---:|" * (len(phase_scores) + 1)]
+    for name, (label, decimals, higher) in METRICS.items():
+        if name not in phase_scores["model"]:
+            continue
+        means = {source: metrics[name]["mean"] for source, metrics in phase_scores.items() if name in metrics}
+        counted = [f"{metrics[name]['frames']} ({metrics[name]['undefined']})" for metrics in phase_scores.values()
+                   if "frames" in metrics.get(name, {})]
+        cells = marked(means, phase_scores, decimals, higher, "**{}**")
+        lines.append(f"| {label} | " + " | ".join(cells) + f" | {', '.join(counted)} |")
+    return lines
+
+
+def _step_table(phase_scores: Mapping[str, Any]) -> list[str]:
+    steps = len(next(iter(phase_scores["model"].values()))["per_step"])
+    lines = ["| metric | source | " + " | ".join(str(step + 1) for step in range(steps)) + " |",
+             "|---|---|" + "---:|" * steps]
+    for name in ("psnr_db", "chamfer_m", "iou_occ_observed", "iou_occ_all"):
+        for source, metrics in phase_scores.items():
+            if name in metrics:
+                label, decimals, _ = METRICS[name]
+                cells = " | ".join(number(value, decimals) for value in metrics[name]["per_step"])
+                lines.append(f"| {label} | {SOURCES[source]} | {cells} |")
+    return lines
+
+
+def _command(options: Options, show: screen.Screen) -> None:
+    evaluate(options, show)
+
+
+def main() -> int:
+    return command_line.run(Options, _command, program="evaluate")
+
+
+if __name__ == "__main__":
+    sys.exit(main())

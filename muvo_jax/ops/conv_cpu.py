@@ -1,0 +1,243 @@
+"""Convolutions whose gradients are fast on a CPU, exact to float32 rounding.
+
+XLA's CPU backend runs a 2D convolution at the speed of a matrix product, but the gradient with respect to the kernel is
+a convolution whose window is the whole image, and 3D convolutions with few channels are about ten times slower than
+need be. Here the kernel gradient is one matrix product per kernel tap, accumulated over chunks that stay in the cache;
+the input gradient is an ordinary convolution with the flipped kernel; and a 3D convolution folds blocks of voxels along
+its last axis into channels, so that a banded kernel and a 2D convolution do the work.
+
+`muvo_jax.ops.conv` is the public face; nothing here checks its arguments. Reverse-mode differentiation only.
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+
+Pairs = tuple[tuple[int, int], ...]
+
+_CHUNK_BYTES = 1 << 20  # what one pass over the kernel taps reads: half of a core's second-level cache
+_FOLDED_WIDTH = 16  # output channels of a folded block below which the matrix product starves
+
+
+def plain(x, kernel, stride: tuple[int, ...], padding: Pairs, kernel_dilation: tuple[int, ...] | None = None):
+    """XLA's convolution of channels-last `x` [N, *S, C] with `kernel` [*K, C, O]."""
+    space = "XYZ"[: kernel.ndim - 2]
+    return lax.conv_general_dilated(x, kernel, stride, padding, rhs_dilation=kernel_dilation,
+                                    dimension_numbers=(f"N{space}C", f"{space}IO", f"N{space}C"))
+
+
+def xla_gradient_is_fast(x_shape: tuple[int, ...], kernel_shape: tuple[int, ...], outputs: int) -> bool:
+    """Whether XLA's own kernel gradient beats ours (measured: 2D, a batch to vectorise over, little work per tap)."""
+    *taps, channels_in, channels_out = kernel_shape
+    operations = 2 * outputs * math.prod(kernel_shape)
+    return len(taps) == 2 and x_shape[0] >= 8 and (channels_in * channels_out <= 1024 or operations < 3e8)
+
+
+def dense(x, kernel, padding: Pairs):
+    """Stride-1 convolution in two or three dimensions: x [N, *S, C], kernel [*K, C, O] -> [N, *S', O]."""
+    if kernel.ndim == 5:
+        return _folded(x, kernel, padding)
+    return _dense_2d(x, kernel, padding, (1, 1))
+
+
+def strided(x, kernel, stride: tuple[int, ...], padding: Pairs):
+    """Convolution with a stride, in two or three dimensions."""
+    if kernel.ndim == 5:
+        return _strided_by_phases(x, kernel, stride, padding)
+    return _strided_2d(x, kernel, stride, padding)
+
+
+@functools.partial(jax.custom_vjp, nondiff_argnums=(2, 3))
+def _dense_2d(x, kernel, padding: Pairs, dilation: tuple[int, int]):
+    return plain(x, kernel, (1, 1), padding, dilation)
+
+
+def _dense_2d_forward(x, kernel, padding, dilation):
+    return plain(x, kernel, (1, 1), padding, dilation), (x, kernel)
+
+
+def _dense_2d_backward(padding, dilation, residuals, gradient):
+    x, kernel = residuals
+    flipped = kernel[::-1, ::-1].swapaxes(2, 3)
+    reach = [(taps - 1) * step for taps, step in zip(kernel.shape[:2], dilation, strict=True)]
+    x_padding = tuple((r - low, r - high) for r, (low, high) in zip(reach, padding, strict=True))
+    x_gradient = plain(gradient, flipped, (1, 1), x_padding, dilation)
+    edges = ((0, 0, 0), *((low, high, 0) for low, high in padding), (0, 0, 0))
+    padded = lax.pad(x, jnp.zeros((), x.dtype), edges)
+    return x_gradient, _kernel_gradient(padded, gradient, kernel.shape[:2], dilation).astype(kernel.dtype)
+
+
+_dense_2d.defvjp(_dense_2d_forward, _dense_2d_backward)
+
+
+def _kernel_gradient(x, gradient, taps: tuple[int, int], dilation: tuple[int, int]):
+    """sum over n, i of x[n, i + tap * dilation]^T gradient[n, i], float32 [*taps, C, O]; x is already padded.
+
+    A chunk is some whole samples or some rows of one sample: small enough that the shifted copies stay in the cache.
+    """
+    batch, _, x_columns, channels_in = x.shape
+    _, rows, columns, channels_out = gradient.shape
+    row_bytes = (x_columns * channels_in + columns * channels_out) * x.dtype.itemsize
+    samples, chunk_rows = _chunk(batch, rows, row_bytes)
+    row_chunks = -(-rows // chunk_rows)
+    missing = row_chunks * chunk_rows - rows
+    if missing:
+        x, gradient = (jnp.pad(a, ((0, 0), (0, missing), (0, 0), (0, 0))) for a in (x, gradient))
+    contract = (((0, 1, 2), (0, 1, 2)), ((), ()))
+
+    def add_chunk(total, chunk):
+        sample, row = (chunk // row_chunks) * samples, (chunk % row_chunks) * chunk_rows
+        outer = lax.dynamic_slice(gradient, (sample, row, 0, 0), (samples, chunk_rows, columns, channels_out))
+
+        def product(tap):
+            start = (sample, row + (tap // taps[1]) * dilation[0], (tap % taps[1]) * dilation[1], 0)
+            inner = lax.dynamic_slice(x, start, (samples, chunk_rows, columns, channels_in))
+            return lax.dot_general(inner, outer, contract, preferred_element_type=total.dtype)
+
+        return total + lax.map(product, jnp.arange(math.prod(taps))), None
+
+    dtype = jnp.promote_types(x.dtype, jnp.float32)
+    zeros = jnp.zeros((math.prod(taps), channels_in, channels_out), dtype)
+    total, _ = lax.scan(add_chunk, zeros, jnp.arange(batch // samples * row_chunks))
+    return total.reshape(*taps, channels_in, channels_out)
+
+
+def _chunk(batch: int, rows: int, row_bytes: int) -> tuple[int, int]:
+    """Samples and rows per chunk: the samples divide the batch, and either all rows or one sample."""
+    sample_bytes = rows * row_bytes
+    if sample_bytes > _CHUNK_BYTES:
+        chunks = min(rows, -(-sample_bytes // _CHUNK_BYTES))
+        return 1, -(-rows // chunks)
+    samples = min(batch, _CHUNK_BYTES // max(sample_bytes, 1))
+    while batch % samples:
+        samples -= 1
+    return samples, rows
+
+
+@functools.partial(jax.custom_vjp, nondiff_argnums=(2,))
+def _folded(x, kernel, padding: Pairs):
+    return _folded_by_2d(x, kernel, padding)
+
+
+def _folded_forward(x, kernel, padding):
+    return _folded_by_2d(x, kernel, padding), (x, kernel)
+
+
+def _folded_backward(padding, residuals, gradient):
+    # Folding again costs little; keeping the folded volume would cost up to three times the memory of x.
+    _, pull_back = jax.vjp(functools.partial(_folded_by_2d, padding=padding), *residuals)
+    return pull_back(gradient)
+
+
+_folded.defvjp(_folded_forward, _folded_backward)
+
+
+def _folded_by_2d(x, kernel, padding: Pairs):
+    """3D convolution as a 2D one over (X, Y * blocks), a block being a few voxels along Z.
+
+    The second spatial axis of the 2D convolution holds y and the block index, so a step in y is a dilation of `blocks`.
+    """
+    batch, x_size, y_size, z_size, _ = x.shape
+    *_, z_taps, _, channels_out = kernel.shape
+    z_low, z_high = padding[2]
+    z_out = z_size + z_low + z_high - z_taps + 1
+    block = _block(z_out, channels_out)
+    blocks = -(-z_out // block)
+    if blocks == 1:
+        windows, band = x, _band(kernel, z_size, block, z_low)
+    else:
+        windows = _overlapping(x, block, blocks, block + z_taps - 1, z_low)
+        band = _band(kernel, block + z_taps - 1, block, 0)
+    flat = windows.reshape(batch, x_size, y_size * blocks, band.shape[2])
+    y_low, y_high = padding[1]
+    out = _dense_2d(flat, band, (padding[0], (y_low * blocks, y_high * blocks)), (1, blocks))
+    out = out.reshape(batch, out.shape[1], out.shape[2] // blocks, blocks * block, channels_out)
+    return out[:, :, :, :z_out]
+
+
+def _block(z_out: int, channels_out: int) -> int:
+    """Voxels per block: enough output channels for a matrix product, all of a short axis (then nothing is copied)."""
+    block = max(2, _FOLDED_WIDTH // channels_out)
+    return z_out if z_out <= max(4, block) else block
+
+
+def _band(kernel, inputs: int, outputs: int, offset: int):
+    """Kernel [X, Y, T, C, O] -> [X, Y, inputs * C, outputs * O]: output o reads inputs o - offset ... + T - 1."""
+    x_taps, y_taps, z_taps, channels_in, channels_out = kernel.shape
+    tap = np.arange(inputs)[:, None] - np.arange(outputs)[None] + offset
+    placement = (tap[None] == np.arange(z_taps)[:, None, None]).astype(np.float32)
+    band = jnp.einsum("xytco,tij->xyicjo", kernel, jnp.asarray(placement, kernel.dtype),
+                      precision=lax.Precision.HIGHEST)
+    return band.reshape(x_taps, y_taps, inputs * channels_in, outputs * channels_out)
+
+
+def _overlapping(x, block: int, blocks: int, window: int, low: int):
+    """[N, X, Y, Z, C] -> [N, X, Y, blocks, window * C]: window b covers z from b * block - low."""
+    *outer, z_size, channels = x.shape
+    pieces = -(-window // block)
+    high = (blocks + pieces - 1) * block - z_size - low
+    edges = ((0, 0, 0),) * 3 + ((low, high, 0), (0, 0, 0))
+    rows = lax.pad(x, jnp.zeros((), x.dtype), edges).reshape(*outer, blocks + pieces - 1, block * channels)
+    widths = [min(block, window - piece * block) * channels for piece in range(pieces)]
+    return jnp.concatenate([rows[:, :, :, piece:piece + blocks, :width] for piece, width in enumerate(widths)], axis=-1)
+
+
+@functools.partial(jax.custom_vjp, nondiff_argnums=(2, 3))
+def _strided_2d(x, kernel, stride: tuple[int, ...], padding: Pairs):
+    return plain(x, kernel, stride, padding)
+
+
+def _strided_2d_forward(x, kernel, stride, padding):
+    return plain(x, kernel, stride, padding), (x, kernel)
+
+
+def _strided_2d_backward(stride, padding, residuals, gradient):
+    _, pull_back = jax.vjp(functools.partial(_strided_by_phases, stride=stride, padding=padding), *residuals)
+    return pull_back(gradient)
+
+
+_strided_2d.defvjp(_strided_2d_forward, _strided_2d_backward)
+
+
+def _strided_by_phases(x, kernel, stride: tuple[int, ...], padding: Pairs):
+    """The same numbers as a stride-1 convolution of space-to-depth blocks, `stride` pixels a block."""
+    *taps, channels_in, channels_out = kernel.shape
+    rank = len(taps)
+    sizes = x.shape[1:-1]
+    blocks = [-(-k // s) for k, s in zip(taps, stride, strict=True)]
+    outs = [(n + low + high - k) // s + 1 for n, (low, high), k, s in zip(sizes, padding, taps, stride, strict=True)]
+    # Rows and columns that no output reads are cut off by the negative padding.
+    edges = [(low, (o + b - 1) * s - n - low, 0)
+             for n, (low, _), o, b, s in zip(sizes, padding, outs, blocks, stride, strict=True)]
+    x = lax.pad(x, jnp.zeros((), x.dtype), ((0, 0, 0), *edges, (0, 0, 0)))
+    kernel_edges = [(0, b * s - k) for b, s, k in zip(blocks, stride, taps, strict=True)]
+    kernel = jnp.pad(kernel, (*kernel_edges, (0, 0), (0, 0)))
+    split = [side for pair in zip(blocks, stride, strict=True) for side in pair]
+    order = (*range(0, 2 * rank, 2), *range(1, 2 * rank, 2), 2 * rank, 2 * rank + 1)
+    kernel = kernel.reshape(*split, channels_in, channels_out).transpose(order)
+    kernel = kernel.reshape(*blocks, math.prod(stride) * channels_in, channels_out)
+    return dense(space_to_depth(x, stride), kernel, ((0, 0),) * rank)
+
+
+def space_to_depth(x, block: tuple[int, ...]):
+    """[N, s0 * b0, ..., C] -> [N, s0, ..., b0 * ... * C]."""
+    batch, *sizes, channels = x.shape
+    rank = len(block)
+    split = [side for n, b in zip(sizes, block, strict=True) for side in (n // b, b)]
+    order = (0, *range(1, 2 * rank, 2), *range(2, 2 * rank + 1, 2), 2 * rank + 1)
+    return x.reshape(batch, *split, channels).transpose(order).reshape(batch, *split[::2], math.prod(block) * channels)
+
+
+def depth_to_space(x, block: tuple[int, ...]):
+    """[N, s0, ..., b0 * ... * C] -> [N, s0 * b0, ..., C], the inverse of `space_to_depth`."""
+    batch, *sizes, channels = x.shape
+    rank = len(block)
+    order = (0, *(axis for i in range(rank) for axis in (1 + i, 1 + rank + i)), 2 * rank + 1)
+    x = x.reshape(batch, *sizes, *block, channels // math.prod(block)).transpose(order)
+    return x.reshape(batch, *(n * b for n, b in zip(sizes, block, strict=True)), x.shape[-1])

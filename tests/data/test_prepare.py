@@ -1,0 +1,128 @@
+"""From raw frames to model inputs, and from presets to recordings."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+import recording_writers as writers
+
+from muvo_jax import config as config_lib
+from muvo_jax import presets
+from muvo_jax.data import kitti, plain, prepare, schema
+
+
+@pytest.fixture
+def kitti_recording(tmp_path):
+    return kitti.KittiRecording(writers.write_kitti(tmp_path, frames=24))
+
+
+@pytest.fixture
+def plain_recording(tmp_path):
+    return plain.PlainRecording(writers.write_plain(tmp_path))
+
+
+def with_description(recording, **changes):
+    recording.description = dataclasses.replace(recording.description, **changes)
+    return recording
+
+
+def test_kitti_gives_the_town_preset_its_sensors(kitti_recording):
+    config, notes = prepare.adapt(presets.get("town"), kitti_recording)
+    # 128x48 scaled to 256 columns has 96 rows, a multiple of 32
+    assert config.model.image_size == (96, 256)
+    lidar = config.model.range_view
+    assert (lidar.rows, lidar.columns) == (64, 256)  # the preset's
+    assert lidar.position_m == (0.0, 0.0, 1.73) and lidar.elevation_max_rad == kitti.LIDAR.elevation_max_rad
+    assert config.model.voxels == presets.get("town").model.voxels
+    assert not config.model.route and config.model.speed
+    assert config.contract.source == "derived"
+    assert any("no occupancy is recorded" in note for note in notes)
+
+
+def test_a_short_recording_gets_short_windows(kitti_recording):
+    config, notes = prepare.adapt(presets.get("town"), kitti_recording)  # 16 frames train, 8 validate
+    data = config.data
+    assert (data.stride, data.context, data.horizon, data.frames) == (1, 4, 4, 8)
+    assert any("short recording" in note and "16 frames" in note for note in notes)
+    assert prepare.adapt(config, kitti_recording).config == config
+
+
+def test_what_the_user_chose_is_kept(kitti_recording):
+    preset = config_lib.override(presets.get("town"), "data.context", 2)
+    data = prepare.adapt(preset, kitti_recording, keep={"data.context"}).config.data
+    assert (data.context, data.horizon) == (2, 4)
+
+
+def test_windows_that_fit_stay(plain_recording):
+    assert prepare.adapt(presets.get("tiny"), plain_recording).config.data == presets.get("tiny").data
+
+
+def test_sequences_shorter_than_the_window(tmp_path):
+    recording = plain.PlainRecording(writers.write_plain(tmp_path, {"train/a": 9, "val_rl/b": 7}))
+    with pytest.raises(schema.DataError, match="'val_rl' has 7 frames, but a window of 8 frames at stride 1 needs 8"):
+        prepare.adapt(presets.get("town"), recording)
+    keep = {"data.frames", "data.stride"}
+    with pytest.raises(schema.DataError, match="'train' has 9 frames, but a window of 12 frames at stride 2 needs 23"):
+        prepare.adapt(presets.get("town"), recording, keep=keep)
+
+
+def test_recorded_voxels_route_and_contract_are_used(plain_recording):
+    config, _ = prepare.adapt(presets.get("tiny"), plain_recording)
+    assert config.model.voxels == plain_recording.description.voxels
+    assert config.model.route and config.model.range_view.position_m == (0.5, 0.0, 2.0)
+    frame = prepare.prepare_frame(plain_recording.read(plain_recording.sequences[0], 3), config)
+    assert (frame["image"] == 3).all() and frame["image"].shape == (32, 64, 3)
+    assert frame["range_view"].shape == (32, 64, 4) and frame["range_view"].dtype == np.float32
+    assert (frame["occupancy"] == 255).all() and (frame["route_map"] == 3).all()
+    assert frame["reward"] == 1.0 and not frame["is_terminal"]
+
+
+def test_a_small_recorded_grid_gets_a_shallower_voxel_decoder(plain_recording):
+    config, notes = prepare.adapt(presets.get("paper-occupancy"), plain_recording)
+    assert config.model.occupancy_blocks == 1 and any("voxel decoder" in note for note in notes)
+    odd = config_lib.VoxelGrid(shape=(24, 16, 16))
+    with pytest.raises(schema.DataError, match=r"24x16x16 .*multiple of 16"):
+        prepare.adapt(presets.get("tiny"), with_description(plain_recording, voxels=odd))
+
+
+def test_what_every_model_needs(plain_recording):
+    without = plain_recording.description.modalities - {"points_m"}
+    with pytest.raises(schema.DataError, match="lacks points_m; every model needs camera, lidar and actions"):
+        prepare.adapt(presets.get("tiny"), with_description(plain_recording, modalities=without))
+
+
+def test_a_flat_image_is_taken_wider_than_the_preset(kitti_recording):
+    config, notes = prepare.adapt(presets.get("tiny"), kitti_recording)
+    # 128x48 has 24 rows at the preset's 64 columns and 36 at 96
+    assert config.model.image_size == (32, 96) and any("become 96x32" in note for note in notes)
+
+
+def test_the_scan_makes_the_occupancy_where_none_is_recorded(kitti_recording):
+    config, _ = prepare.adapt(presets.get("tiny"), kitti_recording)
+    raw = kitti_recording.read(kitti_recording.sequences[0], 0)
+    raw["points_m"] = np.array([[9.0, 0.1, 1.73]], np.float32)
+    occupancy = prepare.prepare_frame(raw, config)["occupancy"]
+    # Voxels of 2 m from (-16, -16, -3): the ray runs along row y 8, layer z 2, from x 8 (lidar) to x 12 (the point).
+    assert occupancy[12, 8, 2] == 1
+    np.testing.assert_array_equal(occupancy[8:12, 8, 2], 0)
+    assert (occupancy == 255).sum() == occupancy.size - 5
+
+
+def test_the_intrinsics_follow_the_image(tmp_path, kitti_recording):
+    config, _ = prepare.adapt(config_lib.override(presets.get("town"), "model.image_size", (64, 192)), kitti_recording)
+    assert config.model.image_size == (64, 192)  # 128x48 -> 192x72, 8 rows cut off at the top
+    frame = prepare.prepare_frame(kitti_recording.read(kitti_recording.sequences[0], 0), config)
+    assert frame["image"].shape == (64, 192, 3)
+    np.testing.assert_allclose(frame["intrinsics"], [[105, 0, 96], [0, 105, 36 - 8], [0, 0, 1]], rtol=1e-6)
+
+
+def test_a_frame_that_does_not_fit_is_named(plain_recording):
+    config, _ = prepare.adapt(presets.get("tiny"), plain_recording)
+    raw = plain_recording.read(plain_recording.sequences[0], 2)
+    raw["image"] = raw["image"][:8]
+    with pytest.raises(schema.DataError, match="frame 2: image of 8x64"):
+        prepare.prepare_frame(raw, config)
+    raw = plain_recording.read(plain_recording.sequences[0], 2)
+    raw["occupancy"] = raw["occupancy"][:8]
+    with pytest.raises(schema.DataError, match=r"frame 2: occupancy has shape \[8, 16, 16\]"):
+        prepare.prepare_frame(raw, config)

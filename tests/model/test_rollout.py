@@ -1,0 +1,168 @@
+"""Observing, imagining and decoding: shapes, randomness, gradients, compilation."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from muvo_jax import presets
+from muvo_jax.model import rollout, world_model
+from muvo_jax.types import Batch, LatentState
+
+CONFIG = presets.get("tiny").model
+MODEL = world_model.WorldModel(CONFIG)
+BATCH, FRAMES, HORIZON = 2, 3, 4
+
+
+def make_batch(batch_size=BATCH, frames=FRAMES, seed=0):
+    random = np.random.default_rng(seed)
+    range_size = (CONFIG.range_view.rows, CONFIG.range_view.columns)
+    return Batch(
+        action=random.uniform(-1, 1, (batch_size, frames, 2)).astype(np.float32),
+        is_first=np.broadcast_to(np.arange(frames)[None] == 0, (batch_size, frames)),
+        image=random.integers(0, 256, (batch_size, frames, *CONFIG.image_size, 3), np.uint8),
+        range_view=random.uniform(-20, 20, (batch_size, frames, *range_size, 4)).astype(np.float32),
+        route_map=random.integers(0, 256, (batch_size, frames, 64, 64), np.uint8),
+        speed_mps=random.uniform(0, 10, (batch_size, frames)).astype(np.float32))
+
+
+@pytest.fixture(scope="module")
+def variables():
+    return jax.tree.map(jnp.asarray, MODEL.init(jax.random.key(0)))
+
+
+@pytest.fixture(scope="module")
+def state():
+    draw = lambda seed, channels: jax.random.normal(jax.random.key(seed), (BATCH, channels))
+    return LatentState(jnp.tanh(draw(1, CONFIG.deterministic_channels)), draw(2, CONFIG.stochastic_channels))
+
+
+@pytest.fixture(scope="module")
+def actions():
+    return jax.random.uniform(jax.random.key(3), (BATCH, HORIZON, 2), minval=-1.0)
+
+
+def close(first, second, tolerance=1e-5):
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=tolerance, rtol=1e-4), first, second)
+
+
+def test_observe_shapes_and_determinism(variables):
+    batch, key = make_batch(), jax.random.key(5)
+    observed = rollout.observe(MODEL, variables, key, batch)
+    assert observed.states.deterministic.shape == (BATCH, FRAMES, CONFIG.deterministic_channels)
+    assert observed.prior.mean.shape == observed.posterior.std.shape == (BATCH, FRAMES, CONFIG.stochastic_channels)
+    close(observed, rollout.observe(MODEL, variables, key, batch), 0)
+    other = rollout.observe(MODEL, variables, jax.random.key(6), batch)
+    assert not np.allclose(observed.states.stochastic, other.states.stochastic)
+
+
+def test_mean_mode_ignores_the_key_and_returns_the_mean(variables, state, actions):
+    batch = make_batch()
+    first = rollout.observe(MODEL, variables, jax.random.key(5), batch, sampled=False)
+    close(first, rollout.observe(MODEL, variables, jax.random.key(6), batch, sampled=False), 0)
+    np.testing.assert_array_equal(first.states.stochastic, first.posterior.mean)
+    dream = rollout.imagine(MODEL, variables, jax.random.key(7), state, actions, sampled=False)
+    np.testing.assert_array_equal(dream.states.stochastic, dream.prior.mean)
+
+
+def test_a_samples_noise_depends_on_its_key_alone(variables):
+    keys = jax.random.split(jax.random.key(8), BATCH)
+    batch = make_batch()
+    whole = rollout.observe(MODEL, variables, keys, batch)
+    close(rollout.observe(MODEL, variables, keys[1:], batch[1:]), whole[1:])
+    noise = rollout.draw_noise(keys, 5, 3, 0.5)
+    close(rollout.draw_noise(keys[1:], 2, 3, 0.5), noise[1:, :2], 0)
+
+
+def test_noise_is_standard_normal_and_its_coin_fair():
+    noise = rollout.draw_noise(jax.random.split(jax.random.key(9), 20), 50, 40, 0.15)
+    for drawn in (noise.prior, noise.posterior):
+        np.testing.assert_allclose([drawn.mean(), drawn.std()], [0, 1], atol=0.02)
+    assert abs(np.corrcoef(noise.prior.ravel(), noise.posterior.ravel())[0, 1]) < 0.02
+    np.testing.assert_allclose(noise.use_prior.mean(), 0.15, atol=0.04)
+    assert noise.use_prior.any(0).any() and not noise.use_prior.all(0).any()  # a coin per sample, not per batch
+
+
+def test_imagine_equals_a_loop_by_hand(variables, state, actions):
+    dream = rollout.imagine(MODEL, variables, jax.random.key(0), state, actions, sampled=False)
+    assert dream.states.stochastic.shape == (BATCH, HORIZON, CONFIG.stochastic_channels)
+    np.testing.assert_array_equal(dream.actions, actions)
+    current = state
+    for step in range(HORIZON):
+        current, prior = MODEL.imagine_step(variables, jnp.zeros_like(state.stochastic), actions[:, step], current)
+        close((dream.states[:, step], dream.prior[:, step]), (current, prior))
+
+
+def test_branches_are_independent_futures(variables, state, actions):
+    fan = jnp.stack([actions, -actions, actions], axis=1)
+    dream = rollout.imagine(MODEL, variables, jax.random.key(1), state, fan, sampled=False)
+    assert dream.features.shape == (BATCH, 3, HORIZON, MODEL.feature_channels)
+    close(dream[:, 0], dream[:, 2])
+    close(dream[:, 1], rollout.imagine(MODEL, variables, jax.random.key(1), state, -actions, sampled=False))
+    sampled = rollout.imagine(MODEL, variables, jax.random.key(1), state, actions, branches=3)
+    assert sampled.states.stochastic.shape == (BATCH, 3, HORIZON, CONFIG.stochastic_channels)
+    assert not np.allclose(sampled.states.stochastic[:, 0], sampled.states.stochastic[:, 1])
+
+
+def test_a_policy_drives_from_the_features(variables, state):
+    steer = lambda key, features: jnp.tanh(features[:2]) + 0.0 * jax.random.uniform(key, (2,))
+    dream = rollout.imagine(MODEL, variables, jax.random.key(2), state, steer, horizon=2, branches=2)
+    np.testing.assert_allclose(dream.actions[:, 1, 0], jnp.tanh(state.features[:, :2]), atol=1e-6)
+    np.testing.assert_allclose(dream.actions[:, :, 1], jnp.tanh(dream.features[:, :, 0, :2]), atol=1e-6)
+
+
+def test_the_learned_policy_is_the_action_head(variables, state):
+    dream = rollout.imagine(MODEL, variables, jax.random.key(2), state, rollout.learned_policy(MODEL, variables),
+                            horizon=2)
+    np.testing.assert_allclose(dream.actions[:, 0], rollout.decode(MODEL, variables, state, ("action",))["action"][1],
+                               atol=1e-6)
+
+
+def test_gradients_reach_actions_and_the_start_state(variables, state, actions):
+    def target(actions, state):
+        dream = rollout.imagine(MODEL, variables, jax.random.key(3), state, actions)
+        return rollout.decode(MODEL, variables, dream.states[:, -1], ("action",))["action"][1].sum()
+
+    by_action, by_state = jax.grad(target, argnums=(0, 1))(actions, state)
+    # The action does not enter the recurrence, but its sample does: every step counts.
+    assert (np.abs(by_action).max(axis=(0, 2)) > 0).all()
+    assert all(np.abs(leaf).max() > 0 for leaf in jax.tree.leaves(by_state))
+
+
+def test_one_compilation_for_equal_shapes(variables, state, actions):
+    before = rollout._imagine._cache_size()
+    policy = lambda weight, key, features: jnp.tanh(weight * features[:2])
+    for value in range(3):
+        rollout.imagine(MODEL, variables, jax.random.key(value), state, 0.1 * value * actions[:, :3])
+    assert rollout._imagine._cache_size() == before + 1
+    for value in range(3):
+        driver = jax.tree_util.Partial(policy, jnp.float32(value))
+        rollout.imagine(world_model.WorldModel(CONFIG), variables, jax.random.key(value), state, driver, horizon=3)
+    assert rollout._imagine._cache_size() == before + 2
+
+
+def test_training_windows_use_dropout_and_update_statistics(variables):
+    batch, keys = make_batch(), jax.random.split(jax.random.key(4), BATCH)
+    window = jax.jit(rollout.observe_window, static_argnums=0, static_argnames=("train", "sampled"))
+    trained, stats = window(MODEL, variables, batch, keys, train=True)
+    again, _ = window(MODEL, variables, batch, keys, train=True)
+    close(trained, again, 0)
+    moved = jax.tree.map(lambda new, old: bool(np.abs(new - old).max() > 0), stats, variables["batch_stats"])
+    assert all(jax.tree.leaves(moved))
+    other, _ = window(MODEL, variables, batch, jax.random.split(jax.random.key(5), BATCH), train=True, sampled=False)
+    mean, _ = window(MODEL, variables, batch, keys, train=True, sampled=False)
+    assert not np.allclose(other.posterior.mean, mean.posterior.mean)  # dropout alone differs
+
+
+@pytest.mark.parametrize("arguments, message", [
+    ({"actions_or_policy": np.zeros((BATCH, 2), np.float32)}, r"expected \[2, H, 2\]"),
+    ({"actions_or_policy": np.zeros((BATCH, 3, 2), np.float32), "horizon": 4}, "horizon=4, but there are 3"),
+    ({"actions_or_policy": np.zeros((BATCH, 5, 3, 2), np.float32), "branches": 4}, "branches=4, but the actions"),
+    ({"actions_or_policy": lambda key, features: features[:2]}, "needs a horizon"),
+    ({"actions_or_policy": np.zeros((BATCH, 3, 2), np.float32), "key": jax.random.split(jax.random.key(0), 5)},
+     "one typed key"),
+    ({"actions_or_policy": np.zeros((BATCH, 3, 2), np.float32), "key": jax.random.PRNGKey(0)}, "one typed key"),
+])
+def test_misfits_are_refused(variables, state, arguments, message):
+    with pytest.raises(ValueError, match=message):
+        rollout.imagine(MODEL, variables, **{"key": jax.random.key(0), "state": state} | arguments)

@@ -1,0 +1,233 @@
+"""Checkpoints: exact round trips, and nothing lost when a file is damaged, the disk is full or the machine changes."""
+
+import dataclasses
+import json
+import os
+import pathlib
+import subprocess
+import sys
+import textwrap
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import muvo_jax
+from muvo_jax import config as config_lib
+from muvo_jax import presets
+from muvo_jax.model import world_model
+from muvo_jax.training import checkpoint, optimizer, run_folder, state
+
+ROOT = pathlib.Path(muvo_jax.__file__).parents[1]
+
+
+@pytest.fixture(scope="module")
+def config():
+    return presets.tiny()
+
+
+@pytest.fixture(scope="module")
+def fresh(config):
+    model = world_model.WorldModel(config.model)
+    adamw = optimizer.make_optimizer(config.optimizer, 10)
+    return state.create(model.init(jax.random.key(0)), adamw, jax.random.key(7))
+
+
+def _at(fresh, step):
+    """A state whose numbers tell the step."""
+    moved = jax.tree.map(lambda leaf: leaf + step, fresh.params)
+    return fresh.replace(params=moved, step=jnp.int32(step), key=jax.random.fold_in(fresh.key, step))
+
+
+def _assert_same(left, right):
+    jax.tree.map(np.testing.assert_array_equal, left.replace(key=jax.random.key_data(left.key)),
+                 right.replace(key=jax.random.key_data(right.key)))
+
+
+def _save(folder, fresh, config, *steps, **options):
+    keeper = checkpoint.Checkpoints(folder, **options)
+    for step in steps:
+        keeper.save(step, _at(fresh, step), config=config, data_state={"position": step}, score=float(-step),
+                    provenance={"name": "town"})
+    return keeper
+
+
+def test_round_trip_restores_every_leaf_the_typed_key_and_the_data_position(tmp_path, fresh, config):
+    _save(tmp_path, fresh, config, 3).close()
+    restored = checkpoint.Checkpoints(tmp_path).restore_latest(fresh, config)
+    _assert_same(restored.state, _at(fresh, 3))
+    assert jax.dtypes.issubdtype(restored.state.key.dtype, jax.dtypes.prng_key)
+    assert (restored.step, restored.data_state, restored.warnings) == (3, {"position": 3}, ())
+    assert restored.meta["contract"]["rate_hz"] == config.contract.rate_hz
+    assert restored.meta["packages"]["jax"] == jax.__version__
+    assert restored.meta["provenance"] == {"name": "town"}
+    assert config_lib.Config.from_dict(restored.meta["config"]) == config
+
+
+def test_data_position_may_be_bytes(tmp_path, fresh, config):
+    keeper = checkpoint.Checkpoints(tmp_path)
+    keeper.save(1, fresh, config=config, data_state=b"\x00\xff")
+    assert keeper.restore_latest(fresh, config).data_state == b"\x00\xff"
+
+
+def test_an_empty_run_has_nothing_to_restore(tmp_path, fresh, config):
+    assert checkpoint.Checkpoints(tmp_path).restore_latest(fresh, config) is None
+
+
+def _truncate(folder):
+    largest = max((path for path in folder.rglob("*") if path.is_file()), key=lambda path: path.stat().st_size)
+    largest.write_bytes(b"")
+
+
+def _flip_a_byte(folder):
+    largest = max((path for path in folder.rglob("*") if path.is_file()), key=lambda path: path.stat().st_size)
+    content = bytearray(largest.read_bytes())
+    content[len(content) // 2] ^= 1
+    largest.write_bytes(content)
+
+
+def _interrupt(folder):
+    (folder / checkpoint.CHECKSUM_FILE).unlink()
+
+
+def _remove_a_file(folder):
+    next(path for path in (folder / "training").rglob("*") if path.is_file()).unlink()
+
+
+@pytest.mark.parametrize("harm", [_truncate, _flip_a_byte, _interrupt, _remove_a_file])
+def test_a_damaged_newest_checkpoint_is_passed_over_and_named(tmp_path, fresh, config, harm):
+    _save(tmp_path, fresh, config, 1, 2).close()
+    harm(tmp_path / "checkpoints" / "2")
+    restored = checkpoint.Checkpoints(tmp_path).restore_latest(fresh, config)
+    _assert_same(restored.state, _at(fresh, 1))
+    assert len(restored.warnings) == 1 and "checkpoints/2 is damaged" in restored.warnings[0]
+    loaded = checkpoint.load_run(tmp_path)
+    assert loaded.step == 1 and "checkpoints/2 is damaged" in loaded.warnings[0]
+
+
+def test_a_damaged_step_can_be_written_again(tmp_path, fresh, config):
+    _save(tmp_path, fresh, config, 1, 2).close()
+    _truncate(tmp_path / "checkpoints" / "2")
+    keeper = checkpoint.Checkpoints(tmp_path)
+    keeper.save(2, _at(fresh, 2), config=config)
+    _assert_same(keeper.restore_latest(fresh, config).state, _at(fresh, 2))
+    assert (tmp_path / checkpoint.DAMAGED_FOLDER / "2").is_dir()
+
+
+def test_only_damaged_checkpoints_is_an_error(tmp_path, fresh, config):
+    _save(tmp_path, fresh, config, 1).close()
+    _truncate(tmp_path / "checkpoints" / "1")
+    with pytest.raises(checkpoint.CheckpointError, match="no readable checkpoint"):
+        checkpoint.Checkpoints(tmp_path).restore_latest(fresh, config)
+    with pytest.raises(checkpoint.CheckpointError, match="no readable checkpoint"):
+        checkpoint.load_run(tmp_path)
+
+
+def test_another_architecture_is_refused_by_naming_both(tmp_path, fresh, config):
+    _save(tmp_path, fresh, config, 1).close()
+    other = dataclasses.replace(config, preset="other", model=dataclasses.replace(config.model, embedding_channels=24))
+    with pytest.raises(ValueError, match=r"preset 'tiny'.*preset 'other'.*embedding_channels 16 .*24"):
+        checkpoint.Checkpoints(tmp_path).restore_latest(fresh, other)
+
+
+def test_keeps_the_last_and_the_best(tmp_path, fresh, config):
+    keeper = checkpoint.Checkpoints(tmp_path, keep_last=2, keep_best=1)
+    for step, score in ((1, 0.0), (2, 5.0), (3, 1.0), (4, None), (5, 2.0)):
+        keeper.save(step, fresh, config=config, score=score)
+    assert keeper.steps() == [2, 4, 5]
+    keeper.close()
+    assert checkpoint.load_run(tmp_path, "best").step == 2
+    assert checkpoint.load_run(tmp_path, "latest").step == 5
+    assert checkpoint.load_run(tmp_path, 4).step == 4
+    with pytest.raises(checkpoint.CheckpointError, match="no step 3; it has 2, 4, 5"):
+        checkpoint.load_run(tmp_path, 3)
+
+
+def test_load_gives_the_model_and_its_variables(tmp_path, fresh, config):
+    _save(tmp_path, fresh, config, 1).close()
+    model, variables = checkpoint.load(tmp_path)
+    assert model == world_model.WorldModel(config.model)
+    jax.tree.map(np.testing.assert_array_equal, variables, _at(fresh, 1).variables)
+
+
+def test_loading_what_is_not_there_says_what_was_expected(tmp_path):
+    with pytest.raises(checkpoint.CheckpointError, match="does not exist"):
+        checkpoint.load_run(tmp_path / "nowhere")
+    with pytest.raises(checkpoint.CheckpointError, match="has no checkpoint yet"):
+        checkpoint.load_run(tmp_path)
+
+
+def test_an_unknown_schema_names_the_version_that_wrote_it(tmp_path, fresh, config, monkeypatch):
+    monkeypatch.setattr(checkpoint, "SCHEMA_VERSION", 99)
+    _save(tmp_path, fresh, config, 1).close()
+    monkeypatch.undo()
+    with pytest.raises(ValueError, match="checkpoint schema 99, this version reads 1"):
+        checkpoint.load_run(tmp_path)
+
+
+def _run(code, devices, **environment):
+    variables = {**os.environ, "JAX_PLATFORMS": "cpu", "PYTHONPATH": str(ROOT),
+                 "XLA_FLAGS": f"--xla_force_host_platform_device_count={devices}", **environment}
+    return subprocess.run([sys.executable, "-c", textwrap.dedent(code)], env=variables, capture_output=True, text=True,
+                          timeout=120, check=False)
+
+
+def test_eight_devices_write_and_one_reads(tmp_path, fresh, config):
+    assert jax.device_count() == 8
+    mesh = jax.make_mesh((8,), ("data",))
+    everywhere = jax.sharding.NamedSharding(mesh, jax.sharding.PartitionSpec())
+    _save(tmp_path, jax.device_put(fresh, everywhere), config, 1).close()
+    result = _run(f"""
+        import jax, json
+        from muvo_jax.training import checkpoint
+        loaded = checkpoint.load_run({str(tmp_path)!r})
+        leaves = jax.tree.leaves(loaded.variables)
+        print(json.dumps([jax.device_count(), len(leaves), sum(float(leaf.sum()) for leaf in leaves)]))
+    """, devices=1)
+    assert result.returncode == 0, result.stderr
+    devices, count, total = json.loads(result.stdout)
+    expected = jax.tree.leaves(_at(fresh, 1).variables)
+    assert (devices, count) == (1, len(expected))
+    assert total == pytest.approx(sum(float(leaf.sum()) for leaf in expected), rel=1e-6)
+
+
+def test_a_full_disk_leaves_the_checkpoint_before_and_says_so(tmp_path, fresh, config):
+    _save(tmp_path, fresh, config, 1).close()
+    result = _run(f"""
+        import resource
+        import jax, jax.numpy as jnp
+        from muvo_jax import presets
+        from muvo_jax.model import world_model
+        from muvo_jax.training import checkpoint, optimizer, state
+        config = presets.tiny()
+        variables = world_model.WorldModel(config.model).init(jax.random.key(0))
+        fresh = state.create(variables, optimizer.make_optimizer(config.optimizer, 10), jax.random.key(7))
+        keeper = checkpoint.Checkpoints({str(tmp_path)!r})
+        resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, 20_000))
+        try:
+            keeper.save(2, fresh, config=config)
+        except checkpoint.CheckpointError as error:
+            print(error)
+        print(keeper.steps(), keeper.restore_latest(fresh, config).step)
+    """, devices=1)
+    assert result.returncode == 0, result.stderr
+    message, kept = result.stdout.strip().splitlines()
+    assert "checkpoint of step 2 could not be written" in message and "Readable checkpoints: 1." in message
+    assert kept == "[1] 1"
+    _assert_same(checkpoint.Checkpoints(tmp_path).restore_latest(fresh, config).state, _at(fresh, 1))
+
+
+def test_run_folder_refuses_what_exists_and_forgets_later_records(tmp_path, config):
+    run_folder.create(tmp_path / "run", config, "again")
+    assert run_folder.read_config(tmp_path / "run") == config
+    with pytest.raises(FileExistsError, match="Go on with it:  again"):
+        run_folder.create(tmp_path / "run", config, "again")
+    files = run_folder.RunFolder(tmp_path / "run")
+    for step in (1, 2, 3):
+        files.log({"kind": "train", "step": step, "total": float("nan") if step == 2 else 1.0})
+    files.close()
+    assert run_folder.forget_after(tmp_path / "run", 2) == 1
+    assert [record["total"] for record in run_folder.read_metrics(tmp_path / "run")] == [1.0, None]
+    with pytest.raises(FileNotFoundError, match="no run to go on with"):
+        run_folder.read_config(tmp_path / "other")

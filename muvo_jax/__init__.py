@@ -1,1 +1,34 @@
-"""MUVO, a multimodal generative world model for driving, in JAX."""
+"""MUVO, a multimodal generative world model for driving, in JAX.
+
+    model, variables = muvo_jax.load("runs/town-tr")
+    observed = muvo_jax.observe(model, variables, key, batch)
+    dream = muvo_jax.imagine(model, variables, key, observed.last, actions)
+    pictures = muvo_jax.decode(model, variables, dream.states, heads=("image", "occupancy"))
+
+Everything is a pure function of explicit pytrees; see docs/design.md.
+"""
+
+from muvo_jax import presets
+from muvo_jax.config import Config, ModelConfig
+from muvo_jax.model.rollout import decode, imagine, observe
+from muvo_jax.model.world_model import WorldModel
+from muvo_jax.types import Batch, Dream, Gaussian, LatentState, Observed
+
+__all__ = [
+    "Batch", "Config", "Dream", "Gaussian", "LatentState", "ModelConfig", "Observed", "WorldModel",
+    "decode", "imagine", "load", "observe", "presets",
+]
+
+
+def load(run):
+    """Loads a trained run: `load("runs/town-tr") -> (model, variables)`.
+
+    Args:
+      run: folder that `python -m muvo_jax.train` wrote.
+
+    Raises:
+      muvo_jax.training.checkpoint.CheckpointError: if the folder holds no readable checkpoint.
+    """
+    from muvo_jax.training import checkpoint  # imported late: imagining needs no checkpoint library
+
+    return checkpoint.load(run)

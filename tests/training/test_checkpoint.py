@@ -29,9 +29,14 @@ def config():
 
 @pytest.fixture(scope="module")
 def fresh(config):
-    model = world_model.WorldModel(config.model)
-    adamw = optimizer.make_optimizer(config.optimizer, 10)
-    return state.create(model.init(jax.random.key(0)), adamw, jax.random.key(7))
+    """A training state with few leaves, for speed; a checkpoint does not look into it."""
+    return _fresh(config)
+
+
+def _fresh(config):
+    variables = {"params": {"layer": {"kernel": jnp.arange(8.0 * 4096).reshape(8, 4096), "bias": jnp.ones(3)}},
+                 "batch_stats": {"norm": {"mean": jnp.zeros(3)}}}
+    return state.create(variables, optimizer.make_optimizer(config.optimizer, 10), jax.random.key(7))
 
 
 def _at(fresh, step):
@@ -195,14 +200,13 @@ def test_eight_devices_write_and_one_reads(tmp_path, fresh, config):
 def test_a_full_disk_leaves_the_checkpoint_before_and_says_so(tmp_path, fresh, config):
     _save(tmp_path, fresh, config, 1).close()
     result = _run(f"""
-        import resource
-        import jax, jax.numpy as jnp
+        import resource, sys
+        sys.path.insert(0, {str(pathlib.Path(__file__).parent)!r})
         from muvo_jax import presets
-        from muvo_jax.model import world_model
-        from muvo_jax.training import checkpoint, optimizer, state
+        from muvo_jax.training import checkpoint
+        from test_checkpoint import _fresh
         config = presets.tiny()
-        variables = world_model.WorldModel(config.model).init(jax.random.key(0))
-        fresh = state.create(variables, optimizer.make_optimizer(config.optimizer, 10), jax.random.key(7))
+        fresh = _fresh(config)
         keeper = checkpoint.Checkpoints({str(tmp_path)!r})
         resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, 20_000))
         try:

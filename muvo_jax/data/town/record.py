@@ -213,8 +213,13 @@ def _work() -> None:
         frames = 0
         for frames, _ in enumerate(record_run(pathlib.Path(order["directory"]), town, Job(*job)), start=1):
             if frames % REPORT_FRAMES == 0:
-                print(REPORT_FRAMES, flush=True)
-        print(Job(*job).frames - frames // REPORT_FRAMES * REPORT_FRAMES, flush=True)
+                _report(REPORT_FRAMES)
+        _report(Job(*job).frames - frames // REPORT_FRAMES * REPORT_FRAMES)
+
+
+def _report(frames: int) -> None:
+    """Workers share one pipe: a line must be a single write."""
+    os.write(sys.stdout.fileno(), f"{frames}\n".encode())
 
 
 if __name__ == "__main__":

@@ -15,6 +15,8 @@ from muvo_jax.data.town import map as map_lib
 
 CAR_RADIUS_M = 1.9
 PERSON_RADIUS_M = 1.6
+CROSSING_RADIUS_M = 3.6  # drivers stop before somebody who is about to walk into their way
+CLEAR_M = 20.0  # nobody starts to cross with a vehicle nearer than this
 CAR_FRONT_M = 2.3
 CLAIM_M = 16.0
 WALK_OFFSET_M = 6.8
@@ -101,7 +103,8 @@ def obstacles(streets: map_lib.Streets, traffic: Traffic, ego_middle_m: np.ndarr
     velocity = traffic.speed_mps[:, None] * np.stack([np.cos(yaw_rad), np.sin(yaw_rad)], 1)
     return (np.concatenate([cars_m, ego_middle_m[None], people_m]),
             np.concatenate([velocity, ego_velocity_mps[None], np.zeros_like(people_m)]),
-            np.concatenate([np.full(len(cars_m) + 1, CAR_RADIUS_M), np.full(len(people_m), PERSON_RADIUS_M)]))
+            np.concatenate([np.full(len(cars_m) + 1, CAR_RADIUS_M),
+                            np.where(traffic.crosses & ~_at_end(traffic), CROSSING_RADIUS_M, PERSON_RADIUS_M)]))
 
 
 def may_enter(streets: map_lib.Streets, traffic: Traffic, ego_node: int, ego_distance_m: float) -> np.ndarray:
@@ -175,8 +178,8 @@ def _walk(traffic: Traffic, vehicles_m: np.ndarray, seed: int, seconds: float) -
     """Pedestrians turn at the ends of their lines; those who cross wait there, and until no vehicle is near."""
     length_m = np.linalg.norm(traffic.walk_to_m - traffic.walk_from_m, axis=1)
     middle_m = 0.5 * (traffic.walk_from_m + traffic.walk_to_m)
-    near = (np.linalg.norm(middle_m[:, None] - vehicles_m[None], axis=-1) < 13.0).any(1)
-    at_end = (traffic.walked_m <= 0) | (traffic.walked_m >= length_m)
+    near = (np.linalg.norm(middle_m[:, None] - vehicles_m[None], axis=-1) < CLEAR_M).any(1)
+    at_end = _at_end(traffic)
     held = traffic.crosses & at_end & ((traffic.wait_s > 0) | near)
     direction = np.where(traffic.walked_m <= 0, 1.0, np.where(traffic.walked_m >= length_m, -1.0,
                                                               traffic.walk_direction))
@@ -187,6 +190,11 @@ def _walk(traffic: Traffic, vehicles_m: np.ndarray, seed: int, seconds: float) -
                                                            np.floor(traffic.walk_mps * 1e4).astype(np.int64)) % 97) / 97
     wait_s = np.where(arrives & traffic.crosses, pause_s, np.maximum(traffic.wait_s - seconds, 0))
     return traffic.replace(walked_m=walked_m, walk_direction=direction, wait_s=wait_s)
+
+
+def _at_end(traffic: Traffic) -> np.ndarray:
+    length_m = np.linalg.norm(traffic.walk_to_m - traffic.walk_from_m, axis=1)
+    return (traffic.walked_m <= 0) | (traffic.walked_m >= length_m)
 
 
 def _walks(streets: map_lib.Streets, count: int, rng: np.random.Generator):

@@ -86,7 +86,7 @@ def dream(options: Options, show: screen.Screen) -> list[pathlib.Path]:
     written = sheets.write_dream(
         options.out or loaded.folder / "dreams", sheets.views_of_batch(batch, 0), views, np.asarray(batch.action[0]),
         sheets.Scene.of(config), context=config.data.context, title=title,
-        name=f"{sequence.split}_{sequence.name.replace('/', '-')}_{window.start:04d}")
+        name=f"{sequence.split}_{sequence.name.rpartition('/')[2]}_{window.start:04d}")
     for path in written:
         show.line(f"wrote {path}")
     return written

@@ -22,11 +22,11 @@ from muvo_jax.training import checkpoint, screen, validation
 
 # metric -> (label, decimals, whether higher is better)
 METRICS = {
-    "psnr_db": ("PSNR [dB]", 2, True), "chamfer_m": ("Chamfer [m]", 3, False),
-    "iou_occ_observed": ("IoU+, unknown ignored", 4, True), "iou_occ_all": ("IoU+, unknown empty", 4, True),
-    "iou_empty_observed": ("IoU-, unknown ignored", 4, True), "iou_empty_all": ("IoU-, unknown empty", 4, True),
+    "psnr_db": ("PSNR (dB)", 2, True), "chamfer_m": ("Chamfer (m)", 3, False),
+    "iou_occ_observed": ("IoU+", 4, True), "iou_empty_observed": ("IoU-", 4, True),
     "precision_observed": ("precision", 4, True), "recall_observed": ("recall", 4, True),
-    "precision_all": ("precision, unknown empty", 4, True), "recall_all": ("recall, unknown empty", 4, True),
+    "iou_occ_all": ("IoU+, unknown = empty", 4, True), "iou_empty_all": ("IoU-, unknown = empty", 4, True),
+    "precision_all": ("precision, unknown = empty", 4, True), "recall_all": ("recall, unknown = empty", 4, True),
 }
 SOURCES = {"model": "model", "copy_last": "copy-last", "training_mean": "training mean"}
 
@@ -130,8 +130,8 @@ def screen_table(split: str, phase: str, scores: Mapping[str, Any]) -> rich.tabl
     if phase == "imagined":
         steps = max(len(metric["per_step"]) for metric in phase_scores["model"].values())
         for source in phase_scores:
-            table.add_column(f"{SOURCES[source]}, step {steps}", justify="right")
-    table.add_column("undefined", justify="right")
+            table.add_column(f"{SOURCES[source]}\nat step {steps}", justify="right")
+    table.add_column("undefined\nframes", justify="right")
     for name, (label, decimals, higher) in METRICS.items():
         if name not in phase_scores["model"]:
             continue

@@ -3,10 +3,9 @@
 The numbers are those of torch.nn.Conv*, ConvTranspose* and MaxPool* with channels last; the form of the computation is
 chosen by backend, here and nowhere else:
 
-  "auto"  on a CPU the forms of muvo_jax.ops.conv_cpu wherever they were measured to be faster than XLA's, elsewhere
-          XLA's convolutions; transposed convolutions are split into phases on every backend.
+  "auto"  "gemm" on a CPU, elsewhere XLA's convolutions, with transposed ones split into phases.
   "xla"   plain XLA, which also supports forward-mode differentiation (jvp, hessian).
-  "gemm"  the CPU forms everywhere; reverse-mode differentiation only.
+  "gemm"  the forms of muvo_jax.ops.conv_cpu, transposed ones split into phases; reverse-mode differentiation only.
 """
 
 from __future__ import annotations
@@ -50,9 +49,7 @@ def conv(x, kernel, *, stride: PerAxis = 1, padding: PerAxis = 0, implementation
         return conv_cpu.plain(x, kernel, strides, pairs)
     if math.prod(taps) == 1:
         return _pointwise(x, kernel, strides, pairs)
-    outputs = x.shape[0] * math.prod((n + 2 * p - k) // s + 1 for n, p, k, s in
-                                     zip(x.shape[1:-1], pads, taps, strides, strict=True))
-    if not _use_cpu_forms(implementation, x, kernel, outputs):
+    if not _use_cpu_forms(implementation):
         return conv_cpu.plain(x, kernel, strides, pairs)
     if rank == 1:
         return _cpu_conv(x[:, None], kernel[None], (1, *strides), ((0, 0), *pairs))[:, 0]
@@ -152,10 +149,8 @@ def _per_axis(name: str, value: PerAxis, rank: int, lowest: int) -> tuple[int, .
     return values
 
 
-def _use_cpu_forms(implementation: str, x, kernel, outputs: int) -> bool:
-    if implementation == "gemm":
-        return True
-    return jax.default_backend() == "cpu" and not conv_cpu.xla_gradient_is_fast(x.shape, kernel.shape, outputs)
+def _use_cpu_forms(implementation: str) -> bool:
+    return implementation == "gemm" or jax.default_backend() == "cpu"
 
 
 def _pointwise(x, kernel, strides, pairs):
@@ -207,8 +202,7 @@ def _phases(x, kernel, strides, pads, outs, implementation):
     kernel = kernel.reshape(*reads, channels_in, math.prod(strides) * channels_out)
     pairs = tuple((q - 1 - f, e - (n - 1))
                   for q, f, e, n in zip(reads, first, last, x.shape[1:-1], strict=True))
-    outputs = x.shape[0] * math.prod(e - f + 1 for f, e in zip(first, last, strict=True))
-    if _use_cpu_forms(implementation, x, kernel, outputs):
+    if _use_cpu_forms(implementation):
         dense = conv_cpu.dense(x, kernel, pairs)
     else:
         dense = conv_cpu.plain(x, kernel, (1,) * rank, pairs)

@@ -2,9 +2,10 @@
 
 XLA's CPU backend runs a 2D convolution at the speed of a matrix product, but the gradient with respect to the kernel is
 a convolution whose window is the whole image, and 3D convolutions with few channels are about ten times slower than
-need be. Here the kernel gradient is one matrix product per kernel tap, accumulated over chunks that stay in the cache;
-the input gradient is an ordinary convolution with the flipped kernel; and a 3D convolution folds blocks of voxels along
-its last axis into channels, so that a banded kernel and a 2D convolution do the work.
+need be. Here the kernel gradient is one matrix product per kernel tap, accumulated over chunks that stay in the cache
+(or XLA's own, where a large batch of narrow images makes that one fast); the input gradient is an ordinary convolution
+with the flipped kernel; and a 3D convolution folds blocks of voxels along its last axis into channels, so that a banded
+kernel and a 2D convolution do the work.
 
 `muvo_jax.ops.conv` is the public face; nothing here checks its arguments. Reverse-mode differentiation only.
 """
@@ -32,11 +33,11 @@ def plain(x, kernel, stride: tuple[int, ...], padding: Pairs, kernel_dilation: t
                                     dimension_numbers=(f"N{space}C", f"{space}IO", f"N{space}C"))
 
 
-def xla_gradient_is_fast(x_shape: tuple[int, ...], kernel_shape: tuple[int, ...], outputs: int) -> bool:
-    """Whether XLA's own kernel gradient beats ours (measured: 2D, a batch to vectorise over, little work per tap)."""
-    *taps, channels_in, channels_out = kernel_shape
-    operations = 2 * outputs * math.prod(kernel_shape)
-    return len(taps) == 2 and x_shape[0] >= 8 and (channels_in * channels_out <= 1024 or operations < 3e8)
+def _xla_gradient_is_fast(x, kernel, gradient) -> bool:
+    """Whether XLA's own kernel gradient beats ours (measured: a batch to vectorise over, little work per tap)."""
+    channels_in, channels_out = kernel.shape[-2:]
+    operations = 2 * gradient.size // channels_out * kernel.size
+    return x.shape[0] >= 8 and (channels_in * channels_out <= 1024 or operations < 3e8)
 
 
 def dense(x, kernel, padding: Pairs):
@@ -68,6 +69,9 @@ def _dense_2d_backward(padding, dilation, residuals, gradient):
     reach = [(taps - 1) * step for taps, step in zip(kernel.shape[:2], dilation, strict=True)]
     x_padding = tuple((r - low, r - high) for r, (low, high) in zip(reach, padding, strict=True))
     x_gradient = plain(gradient, flipped, (1, 1), x_padding, dilation)
+    if _xla_gradient_is_fast(x, kernel, gradient):
+        _, pull_back = jax.vjp(lambda taps: plain(x, taps, (1, 1), padding, dilation), kernel)
+        return x_gradient, *pull_back(gradient)
     edges = ((0, 0, 0), *((low, high, 0) for low, high in padding), (0, 0, 0))
     padded = lax.pad(x, jnp.zeros((), x.dtype), edges)
     return x_gradient, _kernel_gradient(padded, gradient, kernel.shape[:2], dilation).astype(kernel.dtype)
@@ -198,7 +202,8 @@ def _strided_2d_forward(x, kernel, stride, padding):
 
 
 def _strided_2d_backward(stride, padding, residuals, gradient):
-    _, pull_back = jax.vjp(functools.partial(_strided_by_phases, stride=stride, padding=padding), *residuals)
+    form = plain if _xla_gradient_is_fast(*residuals, gradient) else _strided_by_phases
+    _, pull_back = jax.vjp(functools.partial(form, stride=stride, padding=padding), *residuals)
     return pull_back(gradient)
 
 

@@ -1,28 +1,100 @@
-"""Doubling and halving of channels-last maps, with the numbers of torch's interpolate (align_corners False)."""
+"""Changing the resolution of channels-last grids: linear up-sampling, bilinear resizing, mean and nearest cascades.
+
+Linear sampling is that of torch with align_corners=False and no antialiasing: output pixel i reads input position
+(i + 1/2) * (input size / output size) - 1/2, clamped to the grid.
+"""
 
 from __future__ import annotations
 
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 
 
 def upsample_linear(x, factor: int = 2):
-    """Doubles every spatial axis linearly: [N, *S, C] -> [N, *(2 S), C].
+    """Enlarges every spatial axis by `factor`, linearly (torch: bilinear or trilinear, align_corners=False).
 
-    Output 2i is 0.25 x[i-1] + 0.75 x[i], output 2i+1 is 0.75 x[i] + 0.25 x[i+1], the edges repeated, as bilinear and
-    trilinear interpolation without aligned corners have it.
+    Args:
+      x: float [N, *S, C], any number of spatial axes.
+      factor: a positive integer.
+
+    Returns:
+      [N, *(factor * S), C] of the dtype of x.
 
     Raises:
-      ValueError: for another factor than 2.
+      ValueError: for a factor below 1.
     """
-    if factor != 2:
-        raise ValueError(f"upsample_linear: factor {factor}, expected 2.")
+    if factor < 1:
+        raise ValueError(f"upsample_linear: factor is {factor}, expected a positive integer.")
     for axis in range(1, x.ndim - 1):
-        size = x.shape[axis]
-        before = jnp.concatenate([lax.slice_in_dim(x, 0, 1, axis=axis),
-                                  lax.slice_in_dim(x, 0, size - 1, axis=axis)], axis)
-        after = jnp.concatenate([lax.slice_in_dim(x, 1, size, axis=axis),
-                                 lax.slice_in_dim(x, size - 1, size, axis=axis)], axis)
-        pair = jnp.stack([0.25 * before + 0.75 * x, 0.75 * x + 0.25 * after], axis + 1)
-        x = pair.reshape(*x.shape[:axis], 2 * size, *x.shape[axis + 1:])
+        x = _upsample_axis(x, factor, axis)
     return x
+
+
+def _upsample_axis(x, factor: int, axis: int):
+    """Every output phase is a fixed blend of a pixel and its lower or upper neighbour; edges repeat themselves."""
+    if factor == 1:
+        return x
+    size = x.shape[axis]
+    first, last = lax.slice_in_dim(x, 0, 1, axis=axis), lax.slice_in_dim(x, size - 1, size, axis=axis)
+    below = jnp.concatenate([first, lax.slice_in_dim(x, 0, size - 1, axis=axis)], axis)
+    above = jnp.concatenate([lax.slice_in_dim(x, 1, size, axis=axis), last], axis)
+    phases = []
+    for phase in range(factor):
+        offset = (phase + 0.5) / factor - 0.5
+        neighbour = below if offset < 0 else above
+        phases.append(x if offset == 0 else (1 - abs(offset)) * x + abs(offset) * neighbour)
+    shape = (*x.shape[:axis], size * factor, *x.shape[axis + 1:])
+    return jnp.stack(phases, axis + 1).reshape(shape)
+
+
+def resize_bilinear(x, size: tuple[int, int]):
+    """Resizes rows and columns to `size`, linearly and without antialiasing, when shrinking too.
+
+    Args:
+      x: float [..., H, W, C].
+      size: rows and columns of the result.
+
+    Returns:
+      [..., *size, C] of the dtype of x.
+
+    Raises:
+      ValueError: for an empty size.
+    """
+    if min(size) < 1:
+        raise ValueError(f"resize_bilinear: size is {size}, expected two positive integers.")
+    for axis, target in zip((x.ndim - 3, x.ndim - 2), size, strict=True):
+        x = _resize_axis(x, target, axis)
+    return x
+
+
+def _resize_axis(x, target: int, axis: int):
+    size = x.shape[axis]
+    if size == target:
+        return x
+    position = np.clip((np.arange(target) + 0.5) * (size / target) - 0.5, 0, size - 1)
+    low = np.floor(position).astype(np.int32)
+    high = np.minimum(low + 1, size - 1)
+    weight_shape = (1,) * axis + (target,) + (1,) * (x.ndim - axis - 1)
+    weight = jnp.asarray((position - low).reshape(weight_shape), x.dtype)
+    return jnp.take(x, low, axis) * (1 - weight) + jnp.take(x, high, axis) * weight
+
+
+def mean_pool2(x):
+    """Mean of 2x2 pixels, float [..., H, W, C] -> [..., H/2, W/2, C].
+
+    Raises:
+      ValueError: where rows or columns are odd.
+    """
+    *outer, rows, columns, channels = x.shape
+    if rows % 2 or columns % 2:
+        raise ValueError(f"mean_pool2: got {rows}x{columns} pixels, expected even numbers of rows and columns.")
+    return x.reshape(*outer, rows // 2, 2, columns // 2, 2, channels).mean((-4, -2))
+
+
+def nearest_half(x, axes: tuple[int, ...]):
+    """Every second entry (index 2i) along each of `axes`; any dtype, NumPy arrays stay NumPy."""
+    index = [slice(None)] * x.ndim
+    for axis in axes:
+        index[axis] = slice(None, None, 2)
+    return x[tuple(index)]

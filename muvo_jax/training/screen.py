@@ -16,6 +16,8 @@ class Screen:
 
     def __init__(self, console: rich.console.Console | None = None):
         self.console = console or rich.console.Console(highlight=False, soft_wrap=True)
+        if not self.console.is_terminal:  # a file or a pipe has no width of its own
+            self.console.width = 120
         self._bar: rich.progress.Progress | None = None
         self._task: rich.progress.TaskID | None = None
 

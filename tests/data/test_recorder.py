@@ -83,8 +83,8 @@ def test_frames_csv_has_the_agreed_columns(tmp_path):
     record(tmp_path, count=2)
     with (tmp_path / "train/000/frames.csv").open() as file:
         header, first, _ = csv.reader(file)
-    assert header == ["frame_id", "timestamp_s", "x_m", "y_m", "yaw_rad", "speed_mps", "acceleration", "steering", "reward",
-                      "is_terminal", "weather"]
+    assert header == ["frame_id", "timestamp_s", "x_m", "y_m", "yaw_rad", "speed_mps", "acceleration", "steering",
+                      "reward", "is_terminal", "weather"]
     assert first == ["0", "0.0", "0.0", "-1.0", "0.25", "7.1", "-0.3", "0.123456789", "0.5", "false", "clear_noon"]
 
 

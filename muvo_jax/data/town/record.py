@@ -15,8 +15,9 @@ import pathlib
 import subprocess
 import sys
 import tempfile
+import types
 from collections.abc import Callable, Iterator
-from typing import NamedTuple
+from typing import IO, NamedTuple, cast
 
 from muvo_jax import config as config_lib
 from muvo_jax.data import recorder, schema
@@ -24,9 +25,10 @@ from muvo_jax.data.town import settings
 from muvo_jax.data.town.simulator import WEATHER_NAMES, Town
 from muvo_jax.ops import camera as camera_ops
 
+fcntl: types.ModuleType | None
 try:
     import fcntl
-except ImportError:  # Windows: two recordings at once are then up to the user
+except ImportError:  # Windows: there it is up to the user not to record the same town twice at once
     fcntl = None
 
 # Raised by whatever changes the bytes of a recording, so that old caches are not taken for new ones.
@@ -177,9 +179,10 @@ def _record_in_workers(directory: pathlib.Path, town_config: settings.TownConfig
                 process = subprocess.Popen([sys.executable, "-m", "muvo_jax.data.town.record"], stdin=subprocess.PIPE,
                                            stdout=report_end, stderr=errors, text=True, env=environment)
                 processes.append(process)
-                json.dump({"directory": str(directory), "town": dataclasses.asdict(town_config),
-                           "jobs": missing[index::workers]}, process.stdin)
-                process.stdin.close()
+                order = json.dumps({"directory": str(directory), "town": dataclasses.asdict(town_config),
+                                    "jobs": missing[index::workers]})
+                with cast(IO[str], process.stdin) as pipe:
+                    pipe.write(order)
         finally:
             os.close(report_end)
         try:

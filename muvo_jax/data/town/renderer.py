@@ -5,6 +5,9 @@ Camera and lidar sit at the same place, level, so that both are fans of rays for
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from typing import Any
+
 import numpy as np
 
 from muvo_jax.data.town import boxes as box_lib
@@ -78,7 +81,7 @@ class Renderer:
         return {"image": image, "depth_m": np.ascontiguousarray((hits.distance_m / self._stretch[:, None]).T),
                 "classes": classes, "range_view": view, "points_m": range_ops.to_points(view)}
 
-    def occupancy(self, seen: dict[str, np.ndarray]) -> np.ndarray:
+    def occupancy(self, seen: Mapping[str, Any]) -> np.ndarray:
         """The occupancy target from fused depth map and lidar points, uint8 [X, Y, Z] with 0, 1 and 255 (unknown).
 
         All points occupy; the rays that carve are thinned to just under a voxel apart at the border of the grid.
@@ -136,4 +139,5 @@ def _carving_strides(config: settings.TownConfig, focal_px: float) -> tuple[int,
     spacing_rad = 0.9 * config.voxels.voxel_size_m / border_m
     row_rad = (config.lidar.elevation_max_rad - config.lidar.elevation_min_rad) / config.lidar.rows
     column_rad = 2 * np.pi / config.lidar.columns
-    return tuple(max(1, int(spacing_rad / step_rad)) for step_rad in (1 / focal_px, row_rad, column_rad))
+    camera, row, column = (max(1, int(spacing_rad / step_rad)) for step_rad in (1 / focal_px, row_rad, column_rad))
+    return camera, row, column

@@ -19,35 +19,37 @@ def shade(fan: raycast.Fan, hits: raycast.Hits, origin_m: np.ndarray, yaw_rad: f
       image uint8 [R, C, 3] and classes uint8 [R, C].
     """
     shape = fan.slopes.shape
-    colour = np.empty((*shape, 3), np.float32)
-    classes = np.full(shape, box_lib.SKY, np.uint8)
-    azimuth = np.broadcast_to((fan.azimuths_rad + yaw_rad).astype(np.float32)[:, None], shape)
-    sky = hits.box == raycast.NOTHING
-    colour[sky] = _sky(azimuth[sky], fan.slopes[sky], weather)
+    found, distance_m, slope = hits.box.ravel(), hits.distance_m.ravel(), fan.slopes.ravel()
+    azimuth_rad = np.repeat((fan.azimuths_rad + yaw_rad).astype(np.float32), shape[1])
+    flat = np.stack([np.cos(azimuth_rad[::shape[1]]), np.sin(azimuth_rad[::shape[1]])], 1)
+    origin = origin_m.astype(np.float32)
+    colour = np.empty((len(found), 3), np.float32)
+    classes = np.full(len(found), box_lib.SKY, np.uint8)
 
-    flat = np.stack([np.cos(azimuth[:, 0]), np.sin(azimuth[:, 0])], 1)
-    on_ground = hits.box == raycast.GROUND
-    distance_m = hits.distance_m[on_ground]
-    place_m = flat[np.nonzero(on_ground)[0]] * distance_m[:, None] + origin_m[None, :2]
+    sky = np.flatnonzero(found == raycast.NOTHING)
+    colour[sky] = _sky(azimuth_rad[sky], slope[sky], weather)
+
+    here = np.flatnonzero(found == raycast.GROUND)
+    away_m = distance_m[here]
     # A pixel covers more ground along the view than across it: the geometric mean is a fair level of detail.
-    footprint_m = distance_m / focal_px * np.sqrt(np.maximum(distance_m / origin_m[2], 1)).astype(np.float32)
-    albedo, classes[on_ground] = ground_lib.look_up(ground, place_m, footprint_m)
-    colour[on_ground] = _wet_ground(albedo, classes[on_ground], azimuth[on_ground], fan.slopes[on_ground], weather)
+    footprint_m = away_m / np.float32(focal_px) * np.sqrt(np.maximum(away_m / origin[2], 1))
+    albedo, classes[here] = ground_lib.look_up(ground, flat[here // shape[1]] * away_m[:, None] + origin[None, :2],
+                                               footprint_m)
+    colour[here] = _wet_ground(albedo, classes[here], azimuth_rad[here], slope[here], weather)
 
-    on_box = hits.box >= 0
-    box, distance_m = hits.box[on_box], hits.distance_m[on_box]
-    place_m = flat[np.nonzero(on_box)[0]] * distance_m[:, None] + origin_m[None, :2].astype(np.float32)
-    height_m = distance_m * fan.slopes[on_box] + np.float32(origin_m[2])
-    colour[on_box] = _surface(boxes, box, place_m, height_m, weather)
-    classes[on_box] = box_lib.CLASS_OF_MATERIAL[boxes.material[box]]
+    here = np.flatnonzero(found >= 0)
+    away_m, box = distance_m[here], found[here]
+    colour[here] = _surface(boxes, box, flat[here // shape[1]] * away_m[:, None] + origin[None, :2],
+                            away_m * slope[here] + origin[2], weather)
+    classes[here] = box_lib.CLASS_OF_MATERIAL[boxes.material[box]]
 
-    solid = ~sky
-    haze = np.exp(-weather.fog_per_m * hits.distance_m[solid])[:, None]
-    colour[solid] = colour[solid] * haze + np.asarray(weather.horizon, np.float32) * (1 - haze)
-    image = np.ascontiguousarray(colour.transpose(1, 0, 2))
+    haze = np.exp(-np.float32(weather.fog_per_m) * distance_m)
+    haze[sky] = 1
+    colour = colour * haze[:, None] + np.asarray(weather.horizon, np.float32) * (1 - haze)[:, None]
+    image = np.ascontiguousarray(colour.reshape(*shape, 3).transpose(1, 0, 2))
     if weather.rain:
         _add_rain(image, weather, rng)
-    return (np.clip(image, 0, 1) * 255 + 0.5).astype(np.uint8), np.ascontiguousarray(classes.T)
+    return (np.clip(image, 0, 1) * 255 + 0.5).astype(np.uint8), np.ascontiguousarray(classes.reshape(shape).T)
 
 
 def _sun_direction(weather: settings.Weather) -> np.ndarray:
@@ -95,22 +97,29 @@ def _surface(boxes: box_lib.Boxes, box: np.ndarray, place_m: np.ndarray, height_
     depth_z = 0.5 * (z_m[:, 1] - z_m[:, 0]) - np.abs(up)
     face = np.where(depth_z < np.minimum(depth_x, depth_y), 2, np.where(depth_x <= depth_y, 0, 1))
     sign = np.sign(np.where(face == 0, along, np.where(face == 1, across, up)))
-    normal = np.stack([np.where(face == 0, sign * heading[:, 0], np.where(face == 1, -sign * heading[:, 1], 0)),
-                       np.where(face == 0, sign * heading[:, 1], np.where(face == 1, sign * heading[:, 0], 0)),
-                       np.where(face == 2, sign, 0)], 1)
     # On a vertical face u runs along the wall.
     u = np.where(face == 0, across, along)
     half_u = np.where(face == 0, half_m[:, 1], half_m[:, 0])
-    albedo = boxes.colour[box].copy()
+    albedo = boxes.colour[box]
     material = boxes.material[box]
     for kind, paint in _PAINTERS.items():
         here = np.flatnonzero(material == kind)
         if len(here):
             albedo[here] = paint(albedo[here], face[here], sign[here], u[here], half_u[here], height_m[here], z_m[here],
                                  place_m[here])
-    sunny = np.clip(normal @ _sun_direction(weather), 0, 1)[:, None]
-    sky_share = (0.80 + 0.20 * normal[:, 2] + 0.08 * normal[:, 0])[:, None]
-    return albedo * (np.asarray(weather.ambient, np.float32) * sky_share + np.asarray(weather.sun, np.float32) * sunny)
+    return albedo * _face_light(boxes, weather)[box, 2 * face + (sign > 0)]
+
+
+def _face_light(boxes: box_lib.Boxes, weather: settings.Weather) -> np.ndarray:
+    """Light on the faces back, front, right, left, bottom, top of each box, float32 [M, 6, 3]."""
+    cosine, sine = boxes.heading[:, 0], boxes.heading[:, 1]
+    zero, one = np.zeros_like(cosine), np.ones_like(cosine)
+    normal = np.stack([np.stack(axis, -1) for axis in (
+        (-cosine, -sine, zero), (cosine, sine, zero), (sine, -cosine, zero), (-sine, cosine, zero),
+        (zero, zero, -one), (zero, zero, one))], 1)
+    sunny = np.clip(normal @ _sun_direction(weather), 0, 1)[..., None]
+    sky_share = (0.80 + 0.20 * normal[..., 2] + 0.08 * normal[..., 0])[..., None]
+    return np.asarray(weather.ambient, np.float32) * sky_share + np.asarray(weather.sun, np.float32) * sunny
 
 
 def _paint_wall(albedo, face, sign, u, half_u, height_m, z_m, place_m):

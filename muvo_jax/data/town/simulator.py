@@ -6,6 +6,10 @@ is copying it, and stepping it twice gives two futures. The static map belongs t
 
 from __future__ import annotations
 
+import dataclasses
+from collections.abc import Mapping
+from typing import Any
+
 import flax.struct
 import numpy as np
 
@@ -108,9 +112,9 @@ class Town:
         pose, speed_mps = bicycle(state.pose, float(state.speed_mps), action, self.config.contract)
         window = np.arange(max(int(state.progress) - 3, 0), min(int(state.progress) + 12, len(state.route_m)))
         progress = window[np.argmin(np.linalg.norm(state.route_m[window] - pose[:2], axis=1))]
-        moved = state.replace(frame=state.frame + 1, pose=pose, speed_mps=np.array(speed_mps), traffic=traffic,
-                              progress=np.array(progress))
-        return moved.replace(collided=np.array(self._collides(moved)))
+        moved = dataclasses.replace(state, frame=state.frame + 1, pose=pose, speed_mps=np.array(speed_mps),
+                                    traffic=traffic, progress=np.array(progress))
+        return dataclasses.replace(moved, collided=np.array(self._collides(moved)))
 
     def expert(self, state: TownState) -> np.ndarray:
         """The action of a careful driver, float32 [2], who sways and hesitates a little (smoothly, by the seed)."""
@@ -148,7 +152,7 @@ class Town:
         return bool(state.collided) or self._deviation(state)[0] > LOST_M or int(state.progress) >= (
             len(state.route_m) - 40)
 
-    def render(self, state: TownState) -> dict[str, np.ndarray]:
+    def render(self, state: TownState) -> dict[str, Any]:
         """What the sensors measure; see renderer.Renderer.render for the images and points.
 
         Beside them: route_map uint8 [64, 64], speed_mps float32, reward float32, is_terminal bool.
@@ -160,7 +164,7 @@ class Town:
                 "speed_mps": np.float32(state.speed_mps), "reward": np.float32(self.reward(state)),
                 "is_terminal": np.bool_(self.is_terminal(state))}
 
-    def occupancy(self, seen: dict[str, np.ndarray]) -> np.ndarray:
+    def occupancy(self, seen: Mapping[str, Any]) -> np.ndarray:
         """The occupancy target (uint8 [X, Y, Z]: 0, 1, 255) of what `render` returned."""
         return self.renderer.occupancy(seen)
 
@@ -176,14 +180,14 @@ class Town:
             alongs.append(steps)
             length_m += streets.lengths_m[segment]
             segment = int(streets.successors[segment, rng.integers(streets.successor_count[segment])])
-        segment, along_m = np.concatenate(segments), np.concatenate(alongs)
-        points_m, _ = map_lib.locate(streets, segment, along_m)
+        visited = np.concatenate(segments)
+        points_m, _ = map_lib.locate(streets, visited, np.concatenate(alongs))
         travelled_m = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(points_m, axis=0), axis=1))])
         pick = np.searchsorted(travelled_m, skip_m + ROUTE_STEP_M * np.arange(int(self.config.route_m)))
         pick = np.minimum(pick, len(points_m) - 1)
-        node = streets.junction[segment[pick]]
+        node = streets.junction[visited[pick]]
         node = np.where(streets.degree[np.maximum(node, 0)] > 2, node, -1)
-        return points_m[pick], streets.limits_mps[segment[pick]], node
+        return points_m[pick], streets.limits_mps[visited[pick]], node
 
     def _ego_motion(self, state: TownState) -> tuple[np.ndarray, np.ndarray]:
         forward = np.array([np.cos(state.pose[2]), np.sin(state.pose[2])])

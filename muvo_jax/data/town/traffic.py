@@ -7,6 +7,8 @@ passes: whoever is inside, else whoever is nearest.
 
 from __future__ import annotations
 
+import dataclasses
+
 import flax.struct
 import numpy as np
 
@@ -56,7 +58,8 @@ def spawn(streets: map_lib.Streets, config: settings.TownConfig, ego_m: np.ndarr
           rng: np.random.Generator) -> Traffic:
     """Places cars on lanes (none near the ego vehicle or each other) and pedestrians on pavements and crossings."""
     taken_m = [np.asarray(ego_m)]
-    segments, alongs = [], []
+    segments: list[int] = []
+    alongs: list[float] = []
     for _ in range(20 * config.moving_cars):
         if len(segments) == config.moving_cars:
             break
@@ -147,8 +150,8 @@ def step(streets: map_lib.Streets, traffic: Traffic, seed: int, ego_middle_m: np
     speed_mps = np.maximum(0, traffic.speed_mps + acceleration * seconds)
     segment, along_m, turns = _onward(streets, traffic.segment, traffic.along_m + speed_mps * seconds, traffic.turns,
                                       np.arange(count), seed)
-    return _walk(traffic, places_m[:count + 1], seed, seconds).replace(
-        segment=segment, along_m=along_m, turns=turns, speed_mps=speed_mps)
+    return dataclasses.replace(_walk(traffic, places_m[:count + 1], seed, seconds), segment=segment, along_m=along_m,
+                               turns=turns, speed_mps=speed_mps)
 
 
 def _onward(streets: map_lib.Streets, segment, along_m, turns, car, seed: int):
@@ -189,7 +192,7 @@ def _walk(traffic: Traffic, vehicles_m: np.ndarray, seed: int, seconds: float) -
     pause_s = WAIT_S[0] + (WAIT_S[1] - WAIT_S[0]) * (_hash(seed, np.arange(len(at_end)),
                                                            np.floor(traffic.walk_mps * 1e4).astype(np.int64)) % 97) / 97
     wait_s = np.where(arrives & traffic.crosses, pause_s, np.maximum(traffic.wait_s - seconds, 0))
-    return traffic.replace(walked_m=walked_m, walk_direction=direction, wait_s=wait_s)
+    return dataclasses.replace(traffic, walked_m=walked_m, walk_direction=direction, wait_s=wait_s)
 
 
 def _at_end(traffic: Traffic) -> np.ndarray:

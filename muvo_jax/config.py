@@ -92,7 +92,6 @@ class ModelConfig:
       compute_dtype: of the matrix work; parameters, norms, softmax and losses stay float32.
       convolution: "auto" takes the forms of ops/conv.py that are fast on this backend, "xla" the plain ones (needed for
         forward-mode differentiation), "gemm" the CPU forms.
-      remat: recompute the decoders' stages in the backward pass instead of keeping their activations.
       range_scale_m, speed_scale_mps: the model's units.
     """
 
@@ -125,7 +124,6 @@ class ModelConfig:
     occupancy_blocks: int = 3
     compute_dtype: Literal["float32", "bfloat16"] = "float32"
     convolution: Literal["auto", "xla", "gemm"] = "auto"
-    remat: bool = False
     range_scale_m: float = 50.0
     speed_scale_mps: float = 5.0
 

@@ -47,19 +47,17 @@ class PlaneDecoder(linen.Module):
     channels: int
     width: int
     compute: layers.Compute = layers.Compute()
-    remat: bool = False
 
     @linen.compact
     def __call__(self, features: jax.Array) -> dict[int, jax.Array]:
         start, first_stride = plane_start(self.size)
         x = layers.Dense(self.width, self.compute, name="linear")(features)
         x = jax.nn.elu(layers.Unfold(self.width, start, self.compute, name="seed")(x))
-        stage = linen.remat(UpStage) if self.remat else UpStage
         widths = (self.width,) * 3 + (self.width // 2, self.width // 4, self.width // 8)
         out = {}
         for index, (width, kernel) in enumerate(zip(widths, _PLANE_KERNELS, strict=True)):
             stride = first_stride if index == 0 else (2, 2)
-            x = stage(width, kernel, stride, self.compute, name=f"up{index}")(x)
+            x = UpStage(width, kernel, stride, self.compute, name=f"up{index}")(x)
             if index >= 3:
                 scale = 2 ** (5 - index)
                 out[scale] = layers.Dense(self.channels, self.compute, name=f"head_{scale}")(x).astype(jnp.float32)
@@ -102,7 +100,6 @@ class VoxelDecoder(linen.Module):
     width: int
     blocks: int
     compute: layers.Compute = layers.Compute()
-    remat: bool = False
 
     @linen.compact
     def __call__(self, features: jax.Array) -> dict[int, jax.Array]:
@@ -111,12 +108,11 @@ class VoxelDecoder(linen.Module):
         x = jnp.broadcast_to(constant[None], (features.shape[0], *constant.shape))
         x = norm.AdaptiveInstanceNorm(self.compute, name="first_norm")(x, features)
         x = StyledConv(self.width, self.compute, name="first_conv")(x, features)
-        block = linen.remat(StyledUpBlock) if self.remat else StyledUpBlock
         for index in range(self.blocks):
-            x = block(self.width, self.compute, name=f"block{index}")(x, features)
+            x = StyledUpBlock(self.width, self.compute, name=f"block{index}")(x, features)
         out = {}
         for scale, width in ((4, self.width // 2), (2, self.width // 4), (1, self.width // 8)):
-            x = block(width, self.compute, name=f"up_{scale}")(x, features)
+            x = StyledUpBlock(width, self.compute, name=f"up_{scale}")(x, features)
             out[scale] = layers.Dense(self.channels, self.compute, name=f"head_{scale}")(x).astype(jnp.float32)
         return out
 

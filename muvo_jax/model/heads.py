@@ -31,18 +31,17 @@ class Head:
 
 
 def _image(config: ModelConfig, channels: int) -> linen.Module:
-    return decoders.PlaneDecoder(config.image_size, channels, config.decoder_channels, common.compute(config),
-                                 config.remat)
+    return decoders.PlaneDecoder(config.image_size, channels, config.decoder_channels, common.compute(config))
 
 
 def _range_view(config: ModelConfig, channels: int) -> linen.Module:
     size = (config.range_view.rows, config.range_view.columns)
-    return decoders.PlaneDecoder(size, channels, config.decoder_channels, common.compute(config), config.remat)
+    return decoders.PlaneDecoder(size, channels, config.decoder_channels, common.compute(config))
 
 
 def _occupancy(config: ModelConfig, channels: int) -> linen.Module:
     return decoders.VoxelDecoder(config.voxels.shape, channels, config.occupancy_channels, config.occupancy_blocks,
-                                 common.compute(config), config.remat)
+                                 common.compute(config))
 
 
 def _action(config: ModelConfig, channels: int) -> linen.Module:

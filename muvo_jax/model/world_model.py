@@ -87,7 +87,7 @@ class WorldModel:
     def variable_shapes(self) -> dict[str, Any]:
         """The variables as jax.ShapeDtypeStruct leaves."""
         # The plain convolutions trace fastest, and the parameters do not depend on the form.
-        network = Network(dataclasses.replace(self.config, convolution="xla", remat=False))
+        network = Network(dataclasses.replace(self.config, convolution="xla"))
         return dict(_variable_shapes(network))
 
     def init(self, key: jax.Array, batch: Batch | None = None) -> dict[str, Any]:

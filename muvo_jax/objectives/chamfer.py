@@ -52,16 +52,8 @@ def frame_chamfer(some: types.Array, some_mask: types.Array, others: types.Array
     Returns:
       The distance, 0 where undefined, and whether it is defined (both clouds have a point).
     """
-    defined = some_mask.any() & others_mask.any()
-    # Where undefined, every point stands in: the distances stay finite and are then dropped.
-    there = nearest.nearest_distance(some, others, others_mask | ~defined)
-    back = nearest.nearest_distance(others, some, some_mask | ~defined)
-    distance = _masked_mean(there, some_mask) + _masked_mean(back, others_mask)
-    return jnp.where(defined, distance, 0.0), defined
-
-
-def _masked_mean(values: types.Array, mask: types.Array) -> types.Array:
-    return jnp.where(mask, values, 0.0).sum() / jnp.maximum(mask.sum().astype(jnp.float32), 1.0)
+    there, there_count, back, back_count = nearest.chamfer_sums(some, others, some_mask, others_mask)
+    return there / jnp.maximum(there_count, 1.0) + back / jnp.maximum(back_count, 1.0), there_count > 0.0
 
 
 def _subset(cloud: types.Array, mask: types.Array, key: types.Array, points: int) -> tuple[types.Array, types.Array]:

@@ -60,16 +60,41 @@ def beta1(config: config_lib.OptimizerConfig, total_steps: int) -> Schedule:
                      warmup_fraction=config.warmup_fraction)
 
 
-def decays(params) -> dict:
-    """The same tree of bools: which parameters are decayed (all but those with one axis)."""
-    return jax.tree.map(lambda leaf: leaf.ndim != 1, params)
+def pack(tree) -> dict[str, types.Array]:
+    """Lays a tree of parameters (or of their gradients) end to end in two vectors, one for each of AdamW's groups.
+
+    An update of two vectors instead of hundreds of leaves compiles in a fraction of the time.
+
+    Returns:
+      {"decayed": float32 [n], "undecayed": float32 [m]}; undecayed are the parameters with exactly one axis.
+    """
+    groups: dict[str, list[types.Array]] = {"decayed": [], "undecayed": []}
+    for leaf in jax.tree.leaves(tree):
+        groups[_group(leaf)].append(leaf.reshape(-1))
+    return {name: jnp.concatenate([jnp.zeros(0, jnp.float32), *leaves]) for name, leaves in groups.items()}
+
+
+def unpack(packed: dict[str, types.Array], like):
+    """The inverse of `pack`, as a tree of the shapes of `like`."""
+    leaves, structure = jax.tree.flatten(like)
+    taken = dict.fromkeys(packed, 0)
+    out = []
+    for leaf in leaves:
+        name = _group(leaf)
+        out.append(packed[name][taken[name]:taken[name] + leaf.size].reshape(leaf.shape))
+        taken[name] += leaf.size
+    return jax.tree.unflatten(structure, out)
+
+
+def _group(leaf: types.Array) -> str:
+    return "undecayed" if leaf.ndim == 1 else "decayed"
 
 
 def make_optimizer(config: config_lib.OptimizerConfig, total_steps: int) -> optax.GradientTransformation:
-    """AdamW with both schedules, after clipping by the global norm where `clip_norm` is positive."""
+    """AdamW on packed parameters, with both schedules, after clipping by the global norm where `clip_norm` is positive."""
     adamw = optax.inject_hyperparams(optax.adamw, static_args=("mask",))(
         learning_rate=learning_rate(config, total_steps), b1=beta1(config, total_steps), b2=config.beta2,
-        eps=config.epsilon, weight_decay=config.weight_decay, mask=decays)
+        eps=config.epsilon, weight_decay=config.weight_decay, mask={"decayed": True, "undecayed": False})
     if config.clip_norm > 0.0:
         return optax.chain(optax.clip_by_global_norm(config.clip_norm), adamw)
     return adamw

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import optax
 
 from muvo_jax import types
+from muvo_jax.training import optimizer as optimizer_lib
 
 
 @flax.struct.dataclass
@@ -19,7 +20,7 @@ class TrainState:
     Attributes:
       step: int32 scalar, optimiser steps done.
       params, batch_stats: the two parts of the model's variables.
-      opt_state: of the optimiser.
+      opt_state: of the optimiser, over packed parameters (see `optimizer.pack`).
       key: typed key of the run; the randomness of step n is fold_in(key, n), so a resumed run replays it.
     """
 
@@ -48,4 +49,4 @@ def create(variables: types.Variables, optimizer: optax.GradientTransformation, 
     variables = jax.tree.map(lambda leaf: jnp.array(leaf, copy=True), dict(variables))
     params = variables["params"]
     return TrainState(step=jnp.int32(0), params=params, batch_stats=variables.get("batch_stats", {}),
-                      opt_state=optimizer.init(params), key=jax.random.clone(key))
+                      opt_state=optimizer.init(optimizer_lib.pack(params)), key=jax.random.clone(key))

@@ -73,16 +73,18 @@ def make_train_step(model: world_model.WorldModel, config: config_lib.Config, *,
 
     def body(state, batch, axis_name):
         gradients, batch_stats, metrics = gradients_of(state, batch, axis_name)
-        updates, opt_state = optimizer.update(gradients, state.opt_state, state.params)
+        gradients, params = optimizer_lib.pack(gradients), optimizer_lib.pack(state.params)
+        updates, opt_state = optimizer.update(gradients, state.opt_state, params)
         gradient_norm = optax.global_norm(gradients)
         finite = jnp.isfinite(metrics["total"]) & jnp.isfinite(gradient_norm)
-        before = (state.params, state.batch_stats, state.opt_state)
-        after = (optax.apply_updates(state.params, updates), batch_stats, opt_state)
-        params, batch_stats, opt_state = jax.tree.map(lambda new, old: jnp.where(finite, new, old), after, before)
+        before = (params, optimizer_lib.pack(state.batch_stats), state.opt_state)
+        after = (optax.apply_updates(params, updates), optimizer_lib.pack(batch_stats), opt_state)
+        packed, packed_stats, opt_state = jax.tree.map(lambda new, old: jnp.where(finite, new, old), after, before)
         metrics |= {"learning_rate": rate(state.step), "gradient_norm": gradient_norm,
-                    "parameter_norm": optax.global_norm(state.params), "update_norm": optax.global_norm(updates),
+                    "parameter_norm": optax.global_norm(params), "update_norm": optax.global_norm(updates),
                     "finite": finite.astype(jnp.float32)}
-        return state.replace(step=state.step + 1, params=params, batch_stats=batch_stats, opt_state=opt_state), metrics
+        return state.replace(step=state.step + 1, params=optimizer_lib.unpack(packed, state.params),
+                             batch_stats=optimizer_lib.unpack(packed_stats, batch_stats), opt_state=opt_state), metrics
 
     plan = parallel_lib.make_plan(parallel or config.train.parallel, config.train.batch, devices)
     return SpreadFunction(plan, config.optimizer.accumulate, parallel_lib.spread(plan, body, donate_state=True))

@@ -2,6 +2,7 @@
 
 import dataclasses
 
+import chex
 import golden_rule
 import jax
 import jax.numpy as jnp
@@ -59,25 +60,31 @@ def test_updates_match_torch_with_cycled_momentum_and_two_groups():
     gradients = [{name: generator.normal(size=value.shape) for name, value in params.items()} for _ in range(6)]
     optimizer = optimizer_lib.make_optimizer(CONFIG, 10)
     ours = jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float32), params)
-    state = optimizer.init(ours)
+    packed = optimizer_lib.pack(ours)
+    state = optimizer.init(packed)
     for gradient in gradients:
-        gradient = jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float32), gradient)
-        updates, state = optimizer.update(gradient, state, ours)
-        ours = jax.tree.map(jnp.add, ours, updates)
+        gradient = optimizer_lib.pack(jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float32), gradient))
+        updates, state = optimizer.update(gradient, state, packed)
+        packed = jax.tree.map(jnp.add, packed, updates)
+    ours = optimizer_lib.unpack(packed, ours)
     for name, decay in (("kernel", 0.01), ("bias", 0.0), ("scalar", 0.01)):
         expected = torch_adamw(params[name], [gradient[name] for gradient in gradients], decay, 10)
         moved = np.abs(expected - params[name]).max()
         assert np.abs(ours[name] - expected).max() < 1e-3 * moved
 
 
-def test_decay_groups():
-    params = {"kernel": jnp.ones((2, 2)), "bias": jnp.ones(2), "scalar": jnp.ones(())}
-    assert optimizer_lib.decays(params) == {"kernel": True, "bias": False, "scalar": True}
+def test_packing_groups_by_axes_and_loses_nothing():
+    tree = {"kernel": jnp.arange(4.0).reshape(2, 2), "bias": jnp.arange(4.0, 6.0), "scalar": jnp.float32(6.0),
+            "more": {"scale": jnp.arange(7.0, 10.0)}}
+    packed = optimizer_lib.pack(tree)
+    assert sorted(packed["decayed"].tolist()) == [0.0, 1.0, 2.0, 3.0, 6.0]
+    assert sorted(packed["undecayed"].tolist()) == [4.0, 5.0, 7.0, 8.0, 9.0]
+    chex.assert_trees_all_equal(optimizer_lib.unpack(packed, tree), tree)
 
 
 def test_clipping_limits_the_global_norm():
     # Adam's first update does not depend on the gradient's scale, but the second moment keeps it.
-    gradient = {"w": jnp.array([[3.0, 4.0]])}
+    gradient = optimizer_lib.pack({"w": jnp.array([[3.0, 4.0]])})
     for clip_norm, expected in ((0.0, 25.0), (1.0, 1.0)):
         optimizer = optimizer_lib.make_optimizer(dataclasses.replace(CONFIG, clip_norm=clip_norm), 10)
         _, state = optimizer.update(gradient, optimizer.init(gradient), gradient)

@@ -1,11 +1,10 @@
 """One step, three ways to spread it: equal raw gradients, one trace, exact replay.
 
-Gradients are compared before the optimiser (Adam hides a wrong factor), with sampled latents, dropout and prior dropout on,
-and with windows whose masks differ, so that a mean of per-device means would be another number. The tolerance is a share
-of the global norm: a bias in front of a BatchNorm has a true gradient of zero.
+Gradients are compared before the optimiser (Adam hides a wrong factor), with sampled latents, dropout and prior dropout
+on, and with windows whose masks differ, so that a mean of per-device means would be another number. The tolerance is a
+share of the global norm: a bias in front of a BatchNorm has a true gradient of zero.
 """
 
-import dataclasses
 import functools
 
 import jax
@@ -13,92 +12,81 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 import pytest
+import small_world
 
-from muvo_jax import presets, types
 from muvo_jax.model import world_model
 from muvo_jax.training import optimizer as optimizer_lib
 from muvo_jax.training import parallel as parallel_lib
 from muvo_jax.training import state as state_lib
 from muvo_jax.training import step as step_lib
 
-WINDOWS = 8
-TOLERANCE = 2e-5
+TOLERANCE = 1e-5
+TRACES = []
 
 
-def make_config(accumulate=1):
-    config = presets.tiny()
-    return dataclasses.replace(
-        config,
-        model=dataclasses.replace(config.model, dropout=0.2, prior_dropout=0.5),
-        data=dataclasses.replace(config.data, frames=3),
-        train=dataclasses.replace(config.train, batch=WINDOWS // accumulate),
-        optimizer=dataclasses.replace(config.optimizer, accumulate=accumulate),
-        loss=dataclasses.replace(config.loss, chamfer=0.1, chamfer_points=32))
+class CountedWorld(small_world.SmallWorld):
+    """Notes every trace of its first step."""
 
-
-def make_batch(model_config, frames=3, seed=0):
-    """Random windows; window i has more holes and unknown voxels than window i - 1, and window 0 has none."""
-    generator = np.random.default_rng(seed)
-    prefix, share = (WINDOWS, frames), np.linspace(0.0, 0.9, WINDOWS)
-    rows, columns = model_config.range_view.rows, model_config.range_view.columns
-    points = generator.normal(size=(*prefix, rows, columns, 3)).astype(np.float32) * 10
-    range_view = np.concatenate([points, np.linalg.norm(points, axis=-1, keepdims=True)], axis=-1)
-    holes = generator.random((*prefix, rows, columns)) < share[:, None, None, None]
-    range_view[holes] = (0, 0, 0, types.RANGE_NO_RETURN_M)
-    voxels = generator.random((*prefix, *model_config.voxels.shape))
-    occupancy = (voxels < 0.1).astype(np.uint8)
-    unknown = generator.random(voxels.shape) < share[:, None, None, None, None]
-    occupancy[unknown] = types.OCCUPANCY_UNKNOWN
-    return types.Batch(
-        action=generator.uniform(-1, 1, (*prefix, 2)).astype(np.float32),
-        is_first=np.broadcast_to(np.arange(frames) == 0, prefix).copy(),
-        image=generator.integers(0, 256, (*prefix, *model_config.image_size, 3), np.uint8),
-        range_view=range_view, occupancy=occupancy,
-        route_map=generator.integers(0, 2, (*prefix, 64, 64), np.uint8) * np.uint8(255),
-        speed_mps=generator.uniform(0, 10, prefix).astype(np.float32)).validate()
+    def initial_state(self, batch_size):
+        TRACES.append(batch_size)
+        return super().initial_state(batch_size)
 
 
 @functools.cache
 def setting(accumulate=1):
-    """Model, config, batch and a fresh state; the two-step tests share one compiled step per setting."""
-    config = make_config(accumulate)
-    model = world_model.WorldModel(config.model)
-    batch = make_batch(config.model)
+    """Model, config, batch and a fresh state."""
+    config = small_world.make_config(accumulate)
+    model = CountedWorld(config.model)
     optimizer = optimizer_lib.make_optimizer(config.optimizer, config.train.steps)
-    state = state_lib.create(model.init(jax.random.key(0), batch), optimizer, jax.random.key(1))
-    return model, config, batch, state
+    return model, config, small_world.make_batch(config.model), state_lib.create(model.init(), optimizer, jax.random.key(1))
+
+
+def gradients_under(mode, model, config, batch, state):
+    """Gradients, running statistics and metrics of one step, as NumPy."""
+    count = 1 if mode == "single" else config.train.batch
+    plan = parallel_lib.make_plan("auto" if mode == "single" else mode, config.train.batch, jax.devices()[:count])
+    assert (plan.mode, len(plan.devices)) == (mode, count)
+    compiled = parallel_lib.spread(plan, step_lib.gradient_body(model, config))
+    placed = parallel_lib.place_batch(plan, batch, config.optimizer.accumulate)
+    return jax.tree.map(np.asarray, compiled(parallel_lib.place_state(plan, state), placed))
+
+
+def check_equal(got, want):
+    """Gradients within a share of their global norm; statistics and metrics within float32 noise."""
+    norm = float(optax.global_norm(want[0]))
+    assert norm > 1e-3
+    worst = max(jax.tree.leaves(jax.tree.map(lambda a, b: np.abs(a - b).max(), got[0], want[0])))
+    assert worst < TOLERANCE * norm
+    for one, other in zip(jax.tree.leaves(got[1:]), jax.tree.leaves(want[1:]), strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-4, atol=1e-5)
 
 
 @functools.cache
-def spread_gradients(mode, accumulate=1):
-    """Gradients, running statistics and metrics of one step under `mode`, as NumPy."""
-    model, config, batch, state = setting(accumulate)
-    if mode == "single":
-        plan = parallel_lib.make_plan("auto", 1, jax.devices()[:1])
-    else:
-        plan = parallel_lib.make_plan(mode, WINDOWS // accumulate, jax.devices()[:WINDOWS // accumulate])
-    assert plan.mode == mode
-    compiled = parallel_lib.spread(plan, step_lib.gradient_body(model, config))
-    out = compiled(parallel_lib.place_state(plan, state), parallel_lib.place_batch(plan, batch, accumulate))
-    return jax.tree.map(np.asarray, out)
+def gradients_of_one_device(accumulate):
+    return gradients_under("single", *setting(accumulate))
 
 
-def largest_difference(got, want):
-    leaves = jax.tree.leaves(jax.tree.map(lambda a, b: np.abs(a - b).max(), got, want))
-    return max(leaves)
-
-
+@pytest.mark.parametrize("accumulate", [1, 2])
 @pytest.mark.parametrize("mode", ["pmap", "shard_map"])
-def test_eight_devices_give_the_gradients_of_one(mode):
-    assert jax.device_count() >= WINDOWS
-    gradients, batch_stats, metrics = spread_gradients(mode)
-    want_gradients, want_stats, want_metrics = spread_gradients("single")
-    norm = float(optax.global_norm(want_gradients))
-    assert norm > 1e-3
-    assert largest_difference(gradients, want_gradients) < TOLERANCE * norm
-    assert largest_difference(batch_stats, want_stats) < 1e-4
-    for name, value in want_metrics.items():
-        np.testing.assert_allclose(metrics[name], value, rtol=1e-4, err_msg=name)
+def test_many_devices_give_the_gradients_of_one(mode, accumulate):
+    assert jax.device_count() >= small_world.WINDOWS
+    check_equal(gradients_under(mode, *setting(accumulate)), gradients_of_one_device(accumulate))
+
+
+def test_accumulation_averages_the_gradients_of_its_micro_batches():
+    model, config, batch, state = setting(2)
+    body = jax.jit(functools.partial(jax.value_and_grad(step_lib.forward, has_aux=True), model=model, config=config,
+                                     train=True, axis_name=None))
+    batch_stats, parts = state.batch_stats, []
+    for index in range(2):
+        keys = step_lib.sample_keys(state.key, state.step, index, 4, None)
+        (_, (_, batch_stats)), gradients = body(state.params, batch_stats, batch[4 * index:4 * index + 4], keys)
+        parts.append(gradients)
+    mean = jax.tree.map(lambda a, b: (a + b) / 2, *parts)
+    got_gradients, got_stats, _ = gradients_of_one_device(2)
+    norm = float(optax.global_norm(mean))
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=TOLERANCE * norm), got_gradients, mean)
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-5), got_stats, batch_stats)
 
 
 @functools.cache
@@ -113,17 +101,16 @@ def copy_of(state):
 
 def test_one_trace_serves_many_steps():
     model, _, batch, state = setting()
-    step, traces = compiled_step(), []
-    state = copy_of(state)
-    for index in range(3):
-        state, metrics = step(state, make_batch(model.config, seed=index))
-        traces.append(step.compiled._cache_size())
-    assert traces == [1, 1, 1]
-    assert int(state.step) == 3
+    step, state = compiled_step(), copy_of(state)
+    state, _ = step(state, batch)
+    traced = len(TRACES)
+    for seed in range(3):
+        state, metrics = step(state, small_world.make_batch(model.config, seed=seed))
+    state, metrics = step(state, step.place(batch))
+    assert len(TRACES) == traced
+    assert int(state.step) == 5
     assert float(metrics["finite"]) == 1.0
-    # A batch that was placed ahead is the same batch.
-    step(state, step.place(batch))
-    assert step.compiled._cache_size() == 1
+    assert float(metrics["update_norm"]) > 0.0
 
 
 def test_a_step_replays_exactly_from_its_state():
@@ -134,18 +121,32 @@ def test_a_step_replays_exactly_from_its_state():
     for one, other in zip(jax.tree.leaves((first.variables, first_metrics)),
                           jax.tree.leaves((second.variables, second_metrics)), strict=True):
         np.testing.assert_array_equal(one, other)
-    # Another step number is another draw of noise and dropout: the loss of the same batch differs.
+    # Another step number draws other noise and dropout: the loss of the same batch differs.
     _, later_metrics = step(copy_of(state).replace(step=jnp.int32(7)), batch)
     assert float(later_metrics["total"]) != float(first_metrics["total"])
 
 
 def test_a_loss_that_is_not_finite_changes_nothing_but_the_step():
     _, _, batch, state = setting()
-    broken = batch.replace(speed_mps=np.full_like(batch.speed_mps, np.nan))
+    broken = batch.replace(action=np.full_like(batch.action, np.nan))
     after, metrics = compiled_step()(copy_of(state), broken)
     assert float(metrics["finite"]) == 0.0
     assert int(after.step) == 1
     jax.tree.map(np.testing.assert_array_equal, after.variables, state.variables)
+
+
+def test_training_lowers_the_loss_and_validation_agrees_over_devices():
+    model, config, batch, state = setting()
+    validate = {count: step_lib.make_validation_step(model, config, devices=jax.devices()[:count]) for count in (1, 4)}
+    before = validate[1](state, batch)
+    spread = validate[4](state, batch)
+    assert set(spread) == set(before)
+    for name in before:
+        np.testing.assert_allclose(spread[name], before[name], rtol=1e-4, err_msg=name)
+    trained = copy_of(state)
+    for _ in range(4):
+        trained, _ = compiled_step()(trained, batch)
+    assert float(validate[4](trained, batch)["total"]) < float(before["total"])
 
 
 def test_plans():
@@ -165,9 +166,10 @@ def test_plans():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("mode", ["pmap", "shard_map"])
-def test_accumulation_is_spread_the_same_way(mode):
-    gradients, _, metrics = spread_gradients(mode, accumulate=2)
-    want_gradients, _, want_metrics = spread_gradients("single", accumulate=2)
-    norm = float(optax.global_norm(want_gradients))
-    assert largest_difference(gradients, want_gradients) < TOLERANCE * norm
-    np.testing.assert_allclose(metrics["total"], want_metrics["total"], rtol=1e-5)
+def test_the_world_model_itself_gives_the_gradients_of_one_device(mode):
+    config = small_world.make_config()
+    model, batch = world_model.WorldModel(config.model), small_world.make_batch(config.model)
+    optimizer = optimizer_lib.make_optimizer(config.optimizer, config.train.steps)
+    state = state_lib.create(model.init(jax.random.key(0), batch), optimizer, jax.random.key(1))
+    check_equal(gradients_under(mode, model, config, batch, state),
+                gradients_under("single", model, config, batch, state))

@@ -1,0 +1,78 @@
+"""Resampling: worked numbers, agreement with jax.image, cascades."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from muvo_jax.ops import resample
+
+
+def test_upsampling_blends_quarters_and_repeats_the_edges(strict_dtypes):
+    x = jnp.array([0.0, 4.0, 12.0])[None, :, None]
+    # 0.75 of the pixel and 0.25 of the neighbour on that side.
+    np.testing.assert_array_equal(resample.upsample_linear(x)[0, :, 0], [0, 1, 3, 6, 10, 12])
+
+
+@settings(max_examples=10, deadline=None, derandomize=True)
+@given(st.integers(1, 3), st.integers(1, 4), st.integers(0, 99))
+def test_upsampling_and_its_gradient_are_linear_resizing(rank, factor, seed):
+    random = np.random.default_rng(seed)
+    sizes = random.integers(1, 6, rank)
+    x = jnp.asarray(random.normal(size=(2, *sizes, 3)), jnp.float32)
+    by_image = lambda x: jax.image.resize(x, (2, *(int(n) * factor for n in sizes), 3), "linear", antialias=False)
+    with jax.numpy_dtype_promotion("strict"):
+        got, pull_back = jax.vjp(lambda x: resample.upsample_linear(x, factor), x)
+    expected, expected_pull_back = jax.vjp(by_image, x)
+    np.testing.assert_allclose(got, expected, atol=2e-6)
+    cotangent = jnp.asarray(random.normal(size=got.shape), jnp.float32)
+    np.testing.assert_allclose(pull_back(cotangent)[0], expected_pull_back(cotangent)[0], atol=2e-5)
+    tangent = jax.jvp(lambda x: resample.upsample_linear(x, factor), (x,), (x,))[1]
+    np.testing.assert_allclose(tangent, got, atol=2e-6)
+
+
+def test_upsampling_gradient_is_the_transpose_of_the_map(strict_dtypes):
+    x = jnp.zeros((1, 3, 2, 1))
+    forward = jax.vmap(lambda basis: resample.upsample_linear(basis.reshape(x.shape)).reshape(-1))(jnp.eye(6))
+    _, pull_back = jax.vjp(resample.upsample_linear, x)
+    backward = jax.vmap(lambda basis: pull_back(basis.reshape(1, 6, 4, 1))[0].reshape(-1))(jnp.eye(24))
+    np.testing.assert_allclose(backward, forward.T, atol=1e-6)
+
+
+@pytest.mark.parametrize("size", [(3, 5), (8, 8), (5, 7), (13, 2), (1, 1)])
+def test_bilinear_resizing_agrees_with_jax_image(size, strict_dtypes):
+    x = jnp.asarray(np.random.default_rng(0).normal(size=(2, 5, 7, 3)), jnp.float32)
+    expected = jax.image.resize(x, (2, *size, 3), "linear", antialias=False)
+    np.testing.assert_allclose(resample.resize_bilinear(x, size), expected, atol=2e-6)
+
+
+def test_bilinear_resizing_takes_leading_axes_and_does_not_antialias(strict_dtypes):
+    x = jnp.arange(8.0)[None, None, None, :, None] * jnp.ones((2, 3, 1, 1, 1))
+    # Shrinking 8 to 2 reads positions 1.5 and 5.5, not means of four.
+    np.testing.assert_allclose(resample.resize_bilinear(x, (1, 2))[1, 2, 0, :, 0], [1.5, 5.5])
+
+
+def test_mean_pool_cascade_keeps_the_mean(strict_dtypes):
+    x = jnp.asarray(np.random.default_rng(0).normal(size=(2, 3, 4, 8, 3)), jnp.float32)
+    half = resample.mean_pool2(x)
+    assert half.shape == (2, 3, 2, 4, 3)
+    np.testing.assert_allclose(half[0, 1, 0, 0], x[0, 1, :2, :2].mean((0, 1)), rtol=1e-5)
+    np.testing.assert_allclose(resample.mean_pool2(half).mean((2, 3)), x.mean((2, 3)), atol=1e-6)
+
+
+def test_nearest_half_takes_even_indices_and_keeps_the_dtype():
+    x = np.arange(24, dtype=np.uint8).reshape(1, 4, 6)
+    half = resample.nearest_half(x, (1, 2))
+    assert isinstance(half, np.ndarray) and half.dtype == np.uint8
+    np.testing.assert_array_equal(half[0], [[0, 2, 4], [12, 14, 16]])
+
+
+def test_errors_name_what_came():
+    with pytest.raises(ValueError, match="factor is 0"):
+        resample.upsample_linear(jnp.zeros((1, 2, 2, 1)), 0)
+    with pytest.raises(ValueError, match="3x4 pixels"):
+        resample.mean_pool2(jnp.zeros((3, 4, 1)))
+    with pytest.raises(ValueError, match="two positive"):
+        resample.resize_bilinear(jnp.zeros((3, 4, 1)), (0, 2))

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import dataclasses
+import difflib
+import inspect
 import json
 import os
 import pathlib
@@ -10,7 +13,7 @@ import time
 import traceback
 import warnings
 from collections.abc import Callable, Iterable, Sequence
-from typing import Any, TypeVar
+from typing import Annotated, Any, TypeVar
 
 import jax
 import tyro
@@ -25,14 +28,30 @@ EXPECTED_ERRORS = (ValueError, OSError, ArithmeticError)  # DataError, Checkpoin
 _Options = TypeVar("_Options")
 
 
-def run(options_type: type[_Options], work: Callable[[_Options, screen.Screen], None], *, program: str,
-        arguments: Sequence[str] | None = None) -> int:
+def option(metavar: str, default: str = "preset's", of: type = str):
+    """The type of an option that may be left out (None); the help shows what then happens instead of "None"."""
+    return Annotated[of | None, tyro.conf.arg(metavar=metavar, help_behavior_hint=f"(default: {default})")]
+
+
+def run(options_type: type[_Options], work: Callable[[_Options, screen.Screen], Any], *, program: str,
+        examples: str = "", arguments: Sequence[str] | None = None) -> int:
     """Parses the command line and does the work.
+
+    Args:
+      options_type: a dataclass; its docstring is the description.
+      work: gets the options and a screen.
+      program: as in python -m muvo_jax.PROGRAM.
+      examples: command lines for the help.
+      arguments: instead of those of the process.
 
     Returns:
       The exit code: 0 done, 1 an error that was explained, 130 interrupted. A wrong command line raises SystemExit(2).
     """
-    options = tyro.cli(options_type, prog=f"python -m muvo_jax.{program}", args=arguments)
+    arguments = sys.argv[1:] if arguments is None else arguments
+    check_options(options_type, program, arguments)
+    paragraphs = [inspect.getdoc(options_type) or "", "Examples:", *examples.strip().splitlines()]
+    description = "\n\n".join(paragraphs)  # the help joins lines, but not paragraphs
+    options = tyro.cli(options_type, prog=f"python -m muvo_jax.{program}", args=arguments, description=description)
     show = screen.Screen()
     with warnings.catch_warnings():
         warnings.showwarning = lambda message, *_, **__: show.warn(str(message))
@@ -52,6 +71,21 @@ def run(options_type: type[_Options], work: Callable[[_Options, screen.Screen], 
             print("interrupted.", file=sys.stderr)
             return 130
     return 0
+
+
+def check_options(options_type: type, program: str, arguments: Sequence[str]) -> None:
+    """Ends with exit code 2 at an option that does not exist, naming its neighbours."""
+    fields = dataclasses.fields(options_type)
+    known = ["--help", *(f"--{field.name.replace('_', '-')}" for field in fields),
+             *(f"--no-{field.name.replace('_', '-')}" for field in fields if field.default is True)]
+    for argument in arguments:
+        option_name = argument.partition("=")[0].replace("_", "-")
+        if not option_name.startswith("--") or option_name in known:
+            continue
+        near = difflib.get_close_matches(option_name, known, n=3)
+        hint = f"did you mean {' or '.join(near)}?" if near else "the options are " + " ".join(known)
+        print(f"error: unknown option {option_name}; {hint} (python -m muvo_jax.{program} --help)", file=sys.stderr)
+        raise SystemExit(2)
 
 
 def use_compilation_cache() -> None:

@@ -29,35 +29,37 @@ class Options:
     """Observes the first frames of a recorded sequence, imagines the rest under its actions, and draws both.
 
     Writes an animation (GIF) and two sheets (PNG): camera and range image; points and voxels in space.
-
-    Examples:
-      python -m muvo_jax.dream runs/town-tr
-      python -m muvo_jax.dream runs/town-tr --split=val_ds --start=30 --horizon=12
-      python -m muvo_jax.dream runs/town-tr --branches=3                    (three sampled futures)
     """
 
-    run: Annotated[pathlib.Path, tyro.conf.Positional]
+    run: Annotated[pathlib.Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
     """The run's folder."""
     checkpoint: str = "latest"
     """latest, best (validation loss) or a step."""
-    data: str | None = None
+    data: command_line.option("PATH", "the run's") = None
     """Another recording than the one that the run was trained on."""
-    split: str | None = None
-    """By default the first validation split."""
-    sequence: str | None = None
-    """Name of the recorded run; by default the longest of the split."""
-    start: int | None = None
-    """First frame to observe, counted from the sequence's start; by default such that the window lies in its middle."""
-    context: int | None = None
+    split: command_line.option("NAME", "the first validation split") = None
+    """Where to look for a sequence."""
+    sequence: command_line.option("NAME", "the longest of the split") = None
+    """Name of the recorded run."""
+    start: command_line.option("N", "middle of the sequence", of=int) = None
+    """First frame to observe, counted from the sequence's start."""
+    context: command_line.option("N", "the run's", of=int) = None
     """Frames to observe."""
-    horizon: int | None = None
+    horizon: command_line.option("N", "the run's", of=int) = None
     """Frames to imagine."""
     branches: int = 1
     """Futures to sample; 1 takes the mean of each latent."""
     seed: int = 0
     """Of the sampled futures."""
-    out: pathlib.Path | None = None
-    """Where to write; by default RUN/dreams."""
+    out: command_line.option("PATH", "RUN/dreams", of=pathlib.Path) = None
+    """Where to write."""
+
+
+EXAMPLES = """
+python -m muvo_jax.dream runs/town-tr
+python -m muvo_jax.dream runs/town-tr --split=val_ds --start=30 --horizon=12
+python -m muvo_jax.dream runs/town-tr --branches=3  (three sampled futures)
+"""
 
 
 def dream(options: Options, show: screen.Screen) -> list[pathlib.Path]:
@@ -82,7 +84,7 @@ def dream(options: Options, show: screen.Screen) -> list[pathlib.Path]:
     views = {label: sheets.views_of_frames(frames, 0)
              for label, frames in zip(labels[:MOST_COLUMNS], futures[:MOST_COLUMNS], strict=True)}
     sequence = window.sequence
-    title = f"{config.model.variant} step {loaded.step}   {sequence.split} / {sequence.name} from frame {window.start}"
+    title = f"{config.model.variant} step {loaded.step}   {sequence.name} from frame {window.start}"
     written = sheets.write_dream(
         options.out or loaded.folder / "dreams", sheets.views_of_batch(batch, 0), views, np.asarray(batch.action[0]),
         sheets.Scene.of(config), context=config.data.context, title=title,
@@ -135,12 +137,8 @@ def dream_window(model: world_model.WorldModel, variables: types.Variables, key:
     return futures
 
 
-def _command(options: Options, show: screen.Screen) -> None:
-    dream(options, show)
-
-
 def main() -> int:
-    return command_line.run(Options, _command, program="dream")
+    return command_line.run(Options, dream, program="dream", examples=EXAMPLES)
 
 
 if __name__ == "__main__":

@@ -36,33 +36,35 @@ class Options:
     """Judges a run on every split: frames that it observed and frames that it imagined, beside two baselines.
 
     Prints tables and writes RUN/evaluation.json and RUN/report.md.
-
-    Examples:
-      python -m muvo_jax.evaluate runs/town-tr
-      python -m muvo_jax.evaluate runs/town-tr --splits val_ds --windows=0      (all windows)
-      python -m muvo_jax.evaluate runs/town-tr --context=8 --horizon=10 --checkpoint=best
     """
 
-    run: Annotated[pathlib.Path, tyro.conf.Positional]
+    run: Annotated[pathlib.Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
     """The run's folder."""
     checkpoint: str = "latest"
     """latest, best (validation loss) or a step."""
-    splits: tuple[str, ...] = ()
-    """Which ones; by default all, validation first."""
-    data: str | None = None
+    splits: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME ...", help_behavior_hint="(default: all)")] = ()
+    """Which ones to judge."""
+    data: command_line.option("PATH", "the run's") = None
     """Another recording than the one that the run was trained on."""
-    context: int | None = None
+    context: command_line.option("N", "the run's", of=int) = None
     """Frames to observe."""
-    horizon: int | None = None
+    horizon: command_line.option("N", "the run's", of=int) = None
     """Frames to imagine."""
-    windows: int | None = None
+    windows: command_line.option("N", "the run's", of=int) = None
     """At most so many windows of a split, evenly spread; 0 for all."""
-    batch: int | None = None
+    batch: command_line.option("N", "the run's", of=int) = None
     """Windows at a time."""
-    chamfer_points: int | None = None
+    chamfer_points: command_line.option("N", "the run's", of=int) = None
     """Points of each frame that the Chamfer distance looks at; 0 for all."""
-    sampled: bool | None = None
+    sampled: command_line.option("{True,False}", "the run's", of=bool) = None
     """Draw the latents instead of taking their means."""
+
+
+EXAMPLES = """
+python -m muvo_jax.evaluate runs/town-tr
+python -m muvo_jax.evaluate runs/town-tr --splits val_ds --windows=0  (all windows)
+python -m muvo_jax.evaluate runs/town-tr --context=8 --horizon=10 --checkpoint=best
+"""
 
 
 def evaluate(options: Options, show: screen.Screen) -> dict[str, Any]:
@@ -220,12 +222,8 @@ def _step_table(phase_scores: Mapping[str, Any]) -> list[str]:
     return lines
 
 
-def _command(options: Options, show: screen.Screen) -> None:
-    evaluate(options, show)
-
-
 def main() -> int:
-    return command_line.run(Options, _command, program="evaluate")
+    return command_line.run(Options, evaluate, program="evaluate", examples=EXAMPLES)
 
 
 if __name__ == "__main__":

@@ -6,7 +6,7 @@ import dataclasses
 import pathlib
 import shlex
 import sys
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 import tyro
 
@@ -24,57 +24,60 @@ _FIELDS = {"fusion": "model.fusion", "data": "data.path", "steps": "train.steps"
 
 @dataclasses.dataclass(frozen=True)
 class Options:
-    """Trains a multimodal world model on camera and lidar, judges it beside two simple baselines and draws its dreams.
+    """Trains a multimodal world model on camera and lidar, judges it beside two baselines and draws its dreams.
 
     Without options it records a small built-in town and learns to predict it, in minutes, on two CPU cores.
-    A flag beats the preset; --set reaches every other setting. Everything lands in RUNS_DIR/NAME.
 
-    Examples:
-      python -m muvo_jax.train --fusion=tr
-      python -m muvo_jax.train --preset=tiny                              (seconds: does everything run?)
-      python -m muvo_jax.train --data=/data/kitti_raw --name=kitti
-      python -m muvo_jax.train --name=town-tr --resume --steps=800        (go on with a run)
-      python -m muvo_jax.train --preset=paper-occupancy --batch=1 --steps=1 --no-evaluate
-      python -m muvo_jax.train --set loss.kl=0.01 model.dropout=0.0
+    A flag beats the preset; --set reaches every other setting. Everything lands in RUNS_DIR/NAME.
     """
 
-    preset: Annotated[Literal["town", "tiny", "paper", "paper-occupancy"] | None, tyro.conf.arg(metavar="NAME")] = None
-    """Named configuration: town (default, small), tiny (for tests), paper (camera and lidar at the paper's size),
+    preset: command_line.option("NAME", "town") = None
+    """Named configuration: town (small), tiny (for tests), paper (camera and lidar at the paper's size),
     paper-occupancy (with voxels)."""
-    fusion: Literal["tr"] | None = None
+    fusion: command_line.option("NAME") = None
     """How camera and lidar are fused: tr (transformer)."""
-    data: str | None = None
+    data: command_line.option("PATH") = None
     """"town" (built in) or the folder of a recording; its kind is recognised."""
-    name: str | None = None
-    """Of the run; by default made of preset or data, and fusion."""
+    name: command_line.option("NAME", "made of data, preset and fusion") = None
+    """Of the run."""
     runs_dir: pathlib.Path = pathlib.Path("runs")
     """Where runs are kept."""
-    resume: bool = False
+    resume: tyro.conf.FlagCreatePairsOff[bool] = False
     """Go on with the run of that name from its newest readable checkpoint, with the settings it was started with."""
-    steps: int | None = None
+    steps: command_line.option("N", of=int) = None
     """Updates of the whole run. The learning rate follows a schedule over all of them."""
-    batch: int | None = None
+    batch: command_line.option("N", of=int) = None
     """Windows per micro-batch, over all devices."""
-    accumulate: int | None = None
+    accumulate: command_line.option("N", of=int) = None
     """Micro-batches per update."""
-    frames: int | None = None
+    frames: command_line.option("N", of=int) = None
     """Frames of a training window."""
-    stride: int | None = None
+    stride: command_line.option("N", of=int) = None
     """Recorded frames from one frame of a window to the next."""
-    context: int | None = None
+    context: command_line.option("N", of=int) = None
     """Frames that evaluation observes."""
-    horizon: int | None = None
+    horizon: command_line.option("N", of=int) = None
     """Frames that evaluation imagines after them."""
-    learning_rate: float | None = None
+    learning_rate: command_line.option("RATE", of=float) = None
     """Peak of the schedule."""
-    seed: int | None = None
+    seed: command_line.option("N", of=int) = None
     """Of initialisation, order of the data and sampling."""
-    parallel: Literal["auto", "pmap", "shard_map"] | None = None
+    parallel: command_line.option("{auto,pmap,shard_map}") = None
     """How devices share a batch: auto takes shard_map where there is more than one."""
     evaluate: bool = True
     """Judge the trained model on every split and draw a dream at the end."""
-    set: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME=VALUE")] = ()
+    set: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME=VALUE ...")] = ()
     """Any setting of the configuration, such as optimizer.clip_norm=1 (config.json of a run shows them all)."""
+
+
+EXAMPLES = """
+python -m muvo_jax.train --fusion=tr
+python -m muvo_jax.train --preset=tiny  (does everything run?)
+python -m muvo_jax.train --data=/data/kitti_raw --name=kitti
+python -m muvo_jax.train --name=town-tr --resume --steps=800  (goes on with a run)
+python -m muvo_jax.train --preset=paper-occupancy --batch=1 --accumulate=1 --steps=1 --no-evaluate
+python -m muvo_jax.train --set loss.kl=0.01 model.dropout=0.0
+"""
 
 
 def configure(options: Options) -> tuple[config_lib.Config, dict[str, Any], pathlib.Path]:
@@ -157,7 +160,7 @@ def draw_curves(folder: pathlib.Path) -> None:
 
 
 def main() -> int:
-    return command_line.run(Options, train, program="train")
+    return command_line.run(Options, train, program="train", examples=EXAMPLES)
 
 
 if __name__ == "__main__":

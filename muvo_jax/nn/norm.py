@@ -62,7 +62,7 @@ def batch_moments(x: jax.Array, axis_name: str | None) -> tuple[jax.Array, jax.A
     axes = tuple(range(x.ndim - 1))
     count = total(jnp.float32(math.prod(x.shape[:-1])))
     mean = total(jnp.sum(x, axes)) / count
-    # The derivative of the squares by the mean is sum(x - mean) = 0: leaving it out saves a reduction in the backward pass.
+    # The derivative of the squares by the mean is sum(x - mean) = 0: leaving it out saves a reduction backwards.
     centre = layers.per_channel(jax.lax.stop_gradient(mean), x.ndim)
     squares = total(jnp.sum(jnp.square(x - centre), axes))
     return mean, squares / count, squares / jnp.maximum(count - 1.0, 1.0)

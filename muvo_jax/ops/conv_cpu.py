@@ -23,6 +23,7 @@ from jax import lax
 Pairs = tuple[tuple[int, int], ...]
 
 _CHUNK_BYTES = 1 << 20  # what one pass over the kernel taps reads: half of a core's second-level cache
+_LITTLE_WORK = 5e8  # floating-point operations of a kernel gradient below which XLA's own one is at least as fast
 _FOLDED_WIDTH = 16  # output channels of a folded block below which the matrix product starves
 
 
@@ -34,10 +35,10 @@ def plain(x, kernel, stride: tuple[int, ...], padding: Pairs, kernel_dilation: t
 
 
 def _xla_gradient_is_fast(x, kernel, gradient) -> bool:
-    """Whether XLA's own kernel gradient beats ours (measured: a batch to vectorise over, little work per tap)."""
+    """Whether XLA's own kernel gradient beats ours (measured: little work, or narrow and a batch to vectorise over)."""
     channels_in, channels_out = kernel.shape[-2:]
     operations = 2 * gradient.size // channels_out * kernel.size
-    return x.shape[0] >= 8 and (channels_in * channels_out <= 1024 or operations < 3e8)
+    return operations < _LITTLE_WORK or (x.shape[0] >= 8 and channels_in * channels_out <= 1024)
 
 
 def dense(x, kernel, padding: Pairs):

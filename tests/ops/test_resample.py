@@ -16,21 +16,23 @@ def test_upsampling_blends_quarters_and_repeats_the_edges(strict_dtypes):
     np.testing.assert_array_equal(resample.upsample_linear(x)[0, :, 0], [0, 1, 3, 6, 10, 12])
 
 
-@settings(max_examples=10, deadline=None, derandomize=True)
+@settings(max_examples=8, deadline=None, derandomize=True)
 @given(st.integers(1, 3), st.integers(1, 4), st.integers(0, 99))
 def test_upsampling_and_its_gradient_are_linear_resizing(rank, factor, seed):
     random = np.random.default_rng(seed)
     sizes = random.integers(1, 6, rank)
     x = jnp.asarray(random.normal(size=(2, *sizes, 3)), jnp.float32)
     by_image = lambda x: jax.image.resize(x, (2, *(int(n) * factor for n in sizes), 3), "linear", antialias=False)
+    upsample = lambda x: resample.upsample_linear(x, factor)
+    cotangent = jnp.asarray(random.normal(size=jax.eval_shape(by_image, x).shape), jnp.float32)
+    differentiate = lambda f: jax.jit(lambda x, cotangent: (f(x), jax.vjp(f, x)[1](cotangent)[0]))(x, cotangent)
     with jax.numpy_dtype_promotion("strict"):
-        got, pull_back = jax.vjp(lambda x: resample.upsample_linear(x, factor), x)
-    expected, expected_pull_back = jax.vjp(by_image, x)
+        got, gradient = differentiate(upsample)
+        tangent = jax.jit(lambda x: jax.jvp(upsample, (x,), (x,))[1])(x)
+    expected, expected_gradient = differentiate(by_image)
     np.testing.assert_allclose(got, expected, atol=2e-6)
-    cotangent = jnp.asarray(random.normal(size=got.shape), jnp.float32)
-    np.testing.assert_allclose(pull_back(cotangent)[0], expected_pull_back(cotangent)[0], atol=2e-5)
-    tangent = jax.jvp(lambda x: resample.upsample_linear(x, factor), (x,), (x,))[1]
-    np.testing.assert_allclose(tangent, got, atol=2e-6)
+    np.testing.assert_allclose(gradient, expected_gradient, atol=2e-5)
+    np.testing.assert_allclose(tangent, expected, atol=2e-6)
 
 
 def test_upsampling_gradient_is_the_transpose_of_the_map(strict_dtypes):

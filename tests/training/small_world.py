@@ -35,7 +35,7 @@ class SmallNetwork(linen.Module):
     def encode(self, image, range_view, mode, keys):
         image = jax.nn.relu(self.norm(self.convolution(image.astype(jnp.float32) / 255), mode))
         range_view = jax.nn.relu(self.range_norm(self.range_convolution(range_view / 50), mode))
-        pooled = [jnp.concatenate([value.mean(axis=(1, 2)), value.max(axis=(1, 2))], axis=-1)
+        pooled = [jnp.concatenate([value.mean(axis=(1, 2)), jnp.square(value).mean(axis=(1, 2))], axis=-1)
                   for value in (image, range_view)]
         return self.embed(attention.dropout(jnp.concatenate(pooled, axis=-1), keys, 0, self.config.dropout))
 

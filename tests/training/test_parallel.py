@@ -14,6 +14,7 @@ import optax
 import pytest
 import small_world
 
+from muvo_jax import config as config_lib
 from muvo_jax.model import world_model
 from muvo_jax.training import optimizer as optimizer_lib
 from muvo_jax.training import parallel as parallel_lib
@@ -21,6 +22,7 @@ from muvo_jax.training import state as state_lib
 from muvo_jax.training import step as step_lib
 
 TOLERANCE = 1e-5
+FEW = ("image", "action")
 TRACES = []
 
 
@@ -33,12 +35,12 @@ class CountedWorld(small_world.SmallWorld):
 
 
 @functools.cache
-def setting(accumulate=1):
-    """Model, config, batch and a fresh state."""
-    config = small_world.make_config(accumulate)
-    model = CountedWorld(config.model)
+def setting(accumulate=1, heads=config_lib.HEADS):
+    """Model, config, batch and a fresh state; fewer heads where a test is not about the losses (compiling is slow)."""
+    config = small_world.make_config(accumulate, heads=heads)
+    model, batch = CountedWorld(config.model), small_world.make_batch(config.model)
     optimizer = optimizer_lib.make_optimizer(config.optimizer, config.train.steps)
-    return model, config, small_world.make_batch(config.model), state_lib.create(model.init(), optimizer, jax.random.key(1))
+    return model, config, batch, state_lib.create(model.init(), optimizer, jax.random.key(1))
 
 
 def gradients_under(mode, model, config, batch, state):
@@ -62,19 +64,22 @@ def check_equal(got, want):
 
 
 @functools.cache
-def gradients_of_one_device(accumulate):
-    return gradients_under("single", *setting(accumulate))
+def gradients_of_one_device(accumulate, heads):
+    return gradients_under("single", *setting(accumulate, heads))
 
 
-@pytest.mark.parametrize("accumulate", [1, 2])
 @pytest.mark.parametrize("mode", ["pmap", "shard_map"])
-def test_many_devices_give_the_gradients_of_one(mode, accumulate):
+def test_many_devices_give_the_gradients_of_one(mode):
     assert jax.device_count() >= small_world.WINDOWS
-    check_equal(gradients_under(mode, *setting(accumulate)), gradients_of_one_device(accumulate))
+    check_equal(gradients_under(mode, *setting()), gradients_of_one_device(1, config_lib.HEADS))
+
+
+def test_accumulation_is_spread_alike():
+    check_equal(gradients_under("shard_map", *setting(2, FEW)), gradients_of_one_device(2, FEW))
 
 
 def test_accumulation_averages_the_gradients_of_its_micro_batches():
-    model, config, batch, state = setting(2)
+    model, config, batch, state = setting(2, FEW)
     body = jax.jit(functools.partial(jax.value_and_grad(step_lib.forward, has_aux=True), model=model, config=config,
                                      train=True, axis_name=None))
     batch_stats, parts = state.batch_stats, []
@@ -83,7 +88,7 @@ def test_accumulation_averages_the_gradients_of_its_micro_batches():
         (_, (_, batch_stats)), gradients = body(state.params, batch_stats, batch[4 * index:4 * index + 4], keys)
         parts.append(gradients)
     mean = jax.tree.map(lambda a, b: (a + b) / 2, *parts)
-    got_gradients, got_stats, _ = gradients_of_one_device(2)
+    got_gradients, got_stats, _ = gradients_of_one_device(2, FEW)
     norm = float(optax.global_norm(mean))
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=TOLERANCE * norm), got_gradients, mean)
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-5), got_stats, batch_stats)
@@ -135,18 +140,15 @@ def test_a_loss_that_is_not_finite_changes_nothing_but_the_step():
     jax.tree.map(np.testing.assert_array_equal, after.variables, state.variables)
 
 
-def test_training_lowers_the_loss_and_validation_agrees_over_devices():
-    model, config, batch, state = setting()
+def test_validation_agrees_over_devices_and_neither_drops_out_nor_learns():
+    model, config, batch, state = setting(1, FEW)
     validate = {count: step_lib.make_validation_step(model, config, devices=jax.devices()[:count]) for count in (1, 4)}
     before = validate[1](state, batch)
     spread = validate[4](state, batch)
     assert set(spread) == set(before)
     for name in before:
         np.testing.assert_allclose(spread[name], before[name], rtol=1e-4, err_msg=name)
-    trained = copy_of(state)
-    for _ in range(4):
-        trained, _ = compiled_step()(trained, batch)
-    assert float(validate[4](trained, batch)["total"]) < float(before["total"])
+    jax.tree.map(np.testing.assert_array_equal, validate[1](state.replace(step=jnp.int32(3)), batch), before)
 
 
 def test_plans():

@@ -15,7 +15,7 @@ from muvo_jax.ops import resample
 _PLANE_KERNELS = (5, 5, 6, 6, 6, 6)
 
 
-def plane_start(size: tuple[int, int]) -> tuple[tuple[int, int], tuple[int, int]]:
+def plane_start(size: tuple[int, ...]) -> tuple[tuple[int, ...], tuple[int, ...]]:
     """Constant size and stride of the first stage, per axis, so that six stages end at `size` exactly.
 
     A side that is a multiple of 64 starts at side / 64 and doubles six times, as in the reference (320 x 832 from
@@ -31,7 +31,7 @@ class UpStage(linen.Module):
 
     features: int
     kernel: int
-    stride: tuple[int, int]
+    stride: tuple[int, ...]
     compute: layers.Compute = layers.Compute()
 
     @linen.compact

@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 
 from muvo_jax.model.world_model import WorldModel
-from muvo_jax.types import Batch, Dream, LatentState, Observed, Predictions, StepNoise, Variables
+from muvo_jax.types import ArrayLike, Batch, Dream, LatentState, Observed, Predictions, StepNoise, Variables
 
 Policy = Callable[[jax.Array, jax.Array], jax.Array]
 
@@ -59,8 +59,8 @@ def silence(batch_size: int, frames: int, channels: int) -> StepNoise:
     return StepNoise(zeros, zeros, jnp.zeros((batch_size, frames), jnp.bool_))
 
 
-def filter_embeddings(model: WorldModel, variables: Variables, embedding: jax.Array, action: jax.Array,
-                      is_first: jax.Array, noise: StepNoise) -> Observed:
+def filter_embeddings(model: WorldModel, variables: Variables, embedding: jax.Array, action: ArrayLike,
+                      is_first: ArrayLike, noise: StepNoise) -> Observed:
     """Scans observe_step from the zero state over [B, T, ...]; action[t - 1] drives step t, zeros the first one."""
     previous = jnp.concatenate([jnp.zeros_like(action[:, :1]), action[:, :-1]], axis=1)
 
@@ -137,15 +137,15 @@ def imagine(model: WorldModel, variables: Variables, key: jax.Array, state: Late
     """
     batch_size = state.deterministic.shape[0]
     keys = sample_keys(key, batch_size)
+    driver: jax.Array | jax.tree_util.Partial
     if callable(actions_or_policy):
         if horizon is None:
             raise ValueError("imagine: a policy needs a horizon; pass horizon=number of steps.")
-        driver = actions_or_policy
-        if not isinstance(driver, jax.tree_util.Partial):
-            driver = jax.tree_util.Partial(driver)
+        policy = actions_or_policy
+        driver = policy if isinstance(policy, jax.tree_util.Partial) else jax.tree_util.Partial(policy)
     else:
-        driver = jnp.asarray(actions_or_policy)
-        branches, horizon = _check_actions(driver, batch_size, horizon, branches)
+        driver = actions = jnp.asarray(actions_or_policy)
+        branches, horizon = _check_actions(actions, batch_size, horizon, branches)
     return _imagine(model, variables, keys, state, driver, horizon, branches, sampled)
 
 

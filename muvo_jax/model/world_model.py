@@ -131,14 +131,12 @@ class WorldModel:
             steps = jnp.arange(batch.frames)
             frame_keys = jax.vmap(lambda key: jax.vmap(functools.partial(jax.random.fold_in, key))(steps))(keys)
             frame_keys = frame_keys.reshape(-1)
-        network = Network(self.config)
+        batch_stats = variables["batch_stats"]
         if train:
-            embedding, updated = network.apply(variables, frames, mode, frame_keys, method="encode",
-                                               mutable=["batch_stats"])
+            embedding, updated = self._apply(variables, "encode", frames, mode, frame_keys, mutable=["batch_stats"])
             batch_stats = updated["batch_stats"]
         else:
-            embedding = network.apply(variables, frames, mode, None, method="encode")
-            batch_stats = variables["batch_stats"]
+            embedding = self._apply(variables, "encode", frames, mode, None)
         return embedding.reshape(batch.batch_size, batch.frames, -1), batch_stats
 
     def initial_state(self, batch_size: int) -> LatentState:
@@ -161,12 +159,12 @@ class WorldModel:
           the state to go on from, and (prior, posterior). Its sample is the posterior's, or the prior's where
           noise.use_prior says so.
         """
-        return Network(self.config).apply(variables, noise, action, state, embedding, is_first, method="observe_step")
+        return self._apply(variables, "observe_step", noise, action, state, embedding, is_first)
 
     def imagine_step(self, variables: Variables, noise: jax.Array, action: jax.Array,
                      state: LatentState) -> tuple[LatentState, Gaussian]:
         """Moves the state [B, ...] one step by action [B, 2] alone; noise: standard normal [B, S], or zeros."""
-        return Network(self.config).apply(variables, noise, action, state, method="imagine_step")
+        return self._apply(variables, "imagine_step", noise, action, state)
 
     def decode(self, variables: Variables, features: jax.Array, heads: Sequence[str] | None = None) -> Predictions:
         """Decodes latent features [..., D + S] with any leading axes.
@@ -189,15 +187,19 @@ class WorldModel:
             raise ValueError(f"decode: this model has no head {', '.join(unknown)}; "
                              f"it has {', '.join(self.config.heads)}.")
         lead = features.shape[:-1]
-        flat = Network(self.config).apply(variables, features.reshape(-1, features.shape[-1]), names, method="decode")
+        flat = self._apply(variables, "decode", features.reshape(-1, features.shape[-1]), names)
         return {name: {scale: _in_units(value, name, self.config).reshape(*lead, *value.shape[1:])
                        for scale, value in scales.items()} for name, scales in flat.items()}
+
+    def _apply(self, variables: Variables, method: str, *args, **options) -> Any:
+        return Network(self.config).apply(variables, *args, method=method, **options)
 
     def _frames(self, batch: Batch) -> dict[str, Any]:
         """The model's inputs with batch and time merged, [B * T, ...], after checking their sizes."""
         config = self.config
-        expected = {"image": (*config.image_size, 3),
-                    "range_view": (config.range_view.rows, config.range_view.columns, 4)}
+        expected: dict[str, tuple[int, ...]] = {
+            "image": (*config.image_size, 3),
+            "range_view": (config.range_view.rows, config.range_view.columns, 4)}
         if config.route:
             expected["route_map"] = ROUTE_MAP_SIZE
         if config.speed:
@@ -229,7 +231,8 @@ def _variable_shapes(network: Network) -> dict[str, Any]:
               "route_map": jax.ShapeDtypeStruct((1, *ROUTE_MAP_SIZE), jnp.uint8),
               "speed_mps": jax.ShapeDtypeStruct((1,), jnp.float32)}
     state = jax.eval_shape(lambda: WorldModel(config).initial_state(1))
-    noise = StepNoise(state.stochastic, state.stochastic, jax.ShapeDtypeStruct((1,), jnp.bool_))
+    noise = jax.eval_shape(lambda: StepNoise(jnp.zeros((1, config.stochastic_channels)),
+                                             jnp.zeros((1, config.stochastic_channels)), jnp.zeros((1,), jnp.bool_)))
     action = jax.ShapeDtypeStruct((1, 2), jnp.float32)
     init = functools.partial(network.init, method="everything")
     return jax.eval_shape(init, jax.random.key(0), frames, noise, action, state,

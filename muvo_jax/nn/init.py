@@ -71,7 +71,7 @@ def _leaf(path: tuple[str, ...], siblings: Mapping[str, tuple[int, ...]], random
     if leaf == "type_embedding" or (leaf == "bias" and _has_zero_bias(path, siblings)):
         return np.zeros(shape, np.float32)
     if leaf == "bias" and path[-2] == "style":
-        return np.repeat(np.float32([1, 0]), shape[0] // 2)
+        return np.repeat(np.array([1, 0], np.float32), shape[0] // 2)
     if "hidden_kernel" in siblings:
         return _uniform(random, shape, siblings["hidden_kernel"][0] ** -0.5)
     if leaf in ("seed_kernel", "transposed_kernel"):

@@ -27,7 +27,7 @@ class Compute:
     """
 
     dtype: str = "float32"
-    convolution: str = "auto"
+    convolution: conv_ops.Implementation = "auto"
 
 
 def shape_only(key: jax.Array, shape: tuple[int, ...]) -> jax.Array:

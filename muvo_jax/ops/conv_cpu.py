@@ -203,8 +203,9 @@ def _strided_2d_forward(x, kernel, stride, padding):
 
 
 def _strided_2d_backward(stride, padding, residuals, gradient):
-    form = plain if _xla_gradient_is_fast(*residuals, gradient) else _strided_by_phases
-    _, pull_back = jax.vjp(functools.partial(form, stride=stride, padding=padding), *residuals)
+    x, kernel = residuals
+    form = plain if _xla_gradient_is_fast(x, kernel, gradient) else _strided_by_phases
+    _, pull_back = jax.vjp(functools.partial(form, stride=stride, padding=padding), x, kernel)
     return pull_back(gradient)
 
 

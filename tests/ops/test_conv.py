@@ -235,3 +235,16 @@ def test_more_errors():
         conv_ops.conv_transpose(x, kernel, stride=2, output_padding=2)
     with pytest.raises(ValueError, match="half of the window"):
         conv_ops.max_pool(x, window=2, stride=2, padding=2)
+
+
+def test_the_forms_of_an_accelerator_give_the_same_numbers(monkeypatch, strict_dtypes):
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    x, kernel = normal(0, (2, 4, 5, 3), (6, 6, 3, 2))
+    for function in (functools.partial(conv_ops.conv_transpose, stride=2, padding=2),
+                     functools.partial(conv_ops.conv, stride=2, padding=2)):
+        expected, pull_back = jax.vjp(functools.partial(function, implementation="xla"), x, kernel)
+        got, pull_back_fast = jax.vjp(function, x, kernel)
+        assert_near(got, expected)
+        for fast, slow in zip(pull_back_fast(got), pull_back(got), strict=True):
+            assert_near(fast, slow)
+        assert jax.jvp(lambda k, f=function: f(x, k), (kernel,), (kernel,))[1].shape == got.shape

@@ -1,0 +1,230 @@
+"""The loop: a run that was stopped or killed goes on as if nothing had happened, and bad endings are explained."""
+
+import dataclasses
+import io
+import os
+import signal
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import rich.console
+import small_world
+
+from muvo_jax import config as config_lib
+from muvo_jax import presets
+from muvo_jax.data import schema
+from muvo_jax.model import world_model
+from muvo_jax.training import checkpoint, loop, preparation, run_folder, screen
+
+STEPS = 6
+
+
+class SmallWorld(small_world.SmallWorld):
+    """The small model with all that the loop and its validation ask for."""
+
+    def init(self, key, batch=None):
+        del key, batch
+        return super().init()
+
+    def encode(self, variables, batch, *, train=False, keys=None, axis_name=None):
+        return super().encode(variables, batch, train=train, keys=keys, axis_name=axis_name)
+
+    def imagine_step(self, variables, *args):
+        network = small_world.SmallNetwork(self.config)
+        return network.apply(variables, *args, method=lambda module, *values: module.transition.imagine_step(*values))
+
+
+class MemoryRecording:
+    """A recording without files: 14 training frames and 8 to validate."""
+
+    description = schema.RecordingDescription(
+        name="memory", kind="memory", rate_hz=10.0,
+        camera=schema.Camera(64, 32, ((32.0, 0.0, 32.0), (0.0, 32.0, 16.0), (0.0, 0.0, 1.0)),
+                             ((0.0, 0.0, 1.0, 1.0), (-1.0, 0.0, 0.0, 0.0), (0.0, -1.0, 0.0, 2.0), (0.0, 0.0, 0.0, 1.0))),
+        lidar=config_lib.RangeViewGeometry(), voxels=None, contract=config_lib.ActionContract(),
+        modalities=frozenset(schema.RawFrame.__annotations__) - {"occupancy", "reward", "is_terminal"},
+        splits=("train", "val_rl"))
+    sequences = (schema.Sequence("train", "a", 0, 14), schema.Sequence("val_rl", "b", 0, 8))
+
+    def read(self, sequence, index):
+        random = np.random.default_rng([len(sequence.split), index])
+        camera = self.description.camera
+        return {"image": random.integers(0, 255, (32, 64, 3), np.uint8), "intrinsics": np.float32(camera.intrinsics),
+                "camera_to_ego": np.float32(camera.camera_to_ego),
+                "points_m": random.uniform(-20.0, 20.0, (50, 3)).astype(np.float32),
+                "route_map": np.zeros((64, 64), np.uint8), "speed_mps": np.float32(3.0),
+                "action": random.uniform(-1.0, 1.0, 2).astype(np.float32),
+                "timestamp_s": np.float64(index / 10), "frame_id": np.int64(index)}
+
+
+class Interrupting(screen.Screen):
+    """A screen that does something at the log line of one step."""
+
+    def __init__(self, at=None, action=None):
+        self.output = io.StringIO()
+        super().__init__(rich.console.Console(file=self.output, width=200))
+        self._at, self._action = at, action
+
+    def log(self, text):
+        super().log(text)
+        if self._at is not None and text.startswith(f"step {self._at}/"):
+            self._action()
+
+
+@pytest.fixture(autouse=True)
+def small_model(monkeypatch):
+    monkeypatch.setattr(world_model, "WorldModel", SmallWorld)
+
+
+def _config(**train):
+    config = presets.tiny()
+    settings = {"steps": STEPS, "batch": 2, "log_every": 1, "validate_every": 3, "checkpoint_every": 2,
+                "preview_every": 0, "validation_windows": 2, "parallel": "auto", **train}
+    return dataclasses.replace(
+        config, data=dataclasses.replace(config.data, path="memory", frames=3, stride=1, context=2, horizon=2),
+        model=dataclasses.replace(config.model, heads=("image", "action"), dropout=0.2, prior_dropout=0.5),
+        train=dataclasses.replace(config.train, **settings))
+
+
+def _train(folder, show=None, config=None, **options):
+    job = loop.Job(config=config or _config(), folder=folder, open_recording=MemoryRecording, **options)
+    return loop.train(job, show or Interrupting())
+
+
+def _losses(folder):
+    """Everything that was logged and does not depend on the clock."""
+    clock = {"steps_per_s", "waiting_percent"}
+    return [{name: value for name, value in record.items() if name not in clock}
+            for record in run_folder.read_metrics(folder)]
+
+
+def _final(folder):
+    return jax.tree.map(np.asarray, checkpoint.load_run(folder).variables)
+
+
+@pytest.fixture(scope="module")
+def uninterrupted(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("runs") / "whole"
+    patch = pytest.MonkeyPatch()
+    patch.setattr(world_model, "WorldModel", SmallWorld)
+    show = Interrupting()
+    outcome = _train(folder, show)
+    final = _final(folder)
+    patch.undo()
+    return folder, outcome, final, show.output.getvalue()
+
+
+def test_a_run_leaves_its_files_and_says_what_it_does(uninterrupted):
+    folder, outcome, _, text = uninterrupted
+    assert (outcome.step, outcome.stopped) == (STEPS, False)
+    assert run_folder.read_config(folder) == outcome.config
+    kinds = [(record["kind"], record["step"]) for record in _losses(folder)]
+    assert [step for kind, step in kinds if kind == "train"] == [2, 3, 4, 5, 6]  # the first step is its own line
+    assert [step for kind, step in kinds if kind == "validation"] == [3, 6]
+    assert {path.name for path in (folder / "checkpoints").iterdir()} >= {"4", "6"}
+    assert list(folder.glob("events.*"))
+    for part in ("memory", "RV-WOB-TR", "parameters", str(folder), "first loss", "compilation", "peak memory"):
+        assert part in text
+
+
+def test_validation_reports_loss_and_imagined_scores(uninterrupted):
+    record = next(record for record in _losses(uninterrupted[0]) if record["kind"] == "validation")
+    assert record["split"] == "val_rl"
+    assert np.isfinite([record[name] for name in ("total", "psnr_db", "imagined_psnr_db")]).all()
+
+
+@pytest.mark.parametrize("at", [3, 4])
+def test_a_killed_run_resumes_to_the_same_numbers(tmp_path, uninterrupted, at):
+    def die():
+        raise RuntimeError("power failure")
+
+    with pytest.raises(RuntimeError, match="power failure"):
+        _train(tmp_path / "run", Interrupting(at, die))
+    show = Interrupting()
+    _train(tmp_path / "run", show, resume=True)
+    assert f"from step {2 if at == 3 else 2}" in show.output.getvalue()
+    _assert_equal_runs(tmp_path / "run", uninterrupted, after=2)
+
+
+def test_ctrl_c_saves_and_says_how_to_go_on(tmp_path, uninterrupted):
+    show = Interrupting(3, lambda: os.kill(os.getpid(), signal.SIGINT))
+    outcome = _train(tmp_path / "run", show, resume_command="how to go on")
+    assert (outcome.step, outcome.stopped) == (3, True)
+    assert "stopped at step 3 of 6; saved. Go on with:  how to go on" in show.output.getvalue()
+    _train(tmp_path / "run", resume=True)
+    _assert_equal_runs(tmp_path / "run", uninterrupted, after=3)
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
+def _assert_equal_runs(folder, uninterrupted, after):
+    """The same records, but for the line of the first step after a resume, and the same parameters."""
+    whole = [record for record in _losses(uninterrupted[0]) if (record["kind"], record["step"]) != ("train", after + 1)]
+    again = [record for record in _losses(folder) if (record["kind"], record["step"]) != ("train", after + 1)]
+    assert again == whole
+    jax.tree.map(np.testing.assert_array_equal, _final(folder), uninterrupted[2])
+
+
+def test_resuming_past_a_damaged_checkpoint_says_so_and_reaches_the_same_end(tmp_path, uninterrupted):
+    _train(tmp_path / "run", Interrupting(5, lambda: os.kill(os.getpid(), signal.SIGINT)))
+    next(path for path in (tmp_path / "run/checkpoints/5").rglob("*") if path.stat().st_size > 3000).write_bytes(b"")
+    show = Interrupting()
+    _train(tmp_path / "run", show, resume=True)
+    text = show.output.getvalue()
+    assert "checkpoints/5 is damaged" in text and "from step 4" in text
+    assert (tmp_path / "run" / checkpoint.DAMAGED_FOLDER / "5").is_dir()
+    jax.tree.map(np.testing.assert_array_equal, _final(tmp_path / "run"), uninterrupted[2])
+
+
+def test_an_existing_run_is_refused_and_left_alone(uninterrupted):
+    folder = uninterrupted[0]
+    before = (folder / "metrics.jsonl").read_bytes()
+    with pytest.raises(FileExistsError, match=r"exists and has checkpoints\. Go on with it:  again"):
+        _train(folder, resume_command="again")
+    assert (folder / "metrics.jsonl").read_bytes() == before
+
+
+def test_a_finished_run_has_nothing_left_to_train(uninterrupted):
+    show = Interrupting()
+    outcome = _train(uninterrupted[0], show, resume=True)
+    assert outcome.step == STEPS and "nothing left to train" in show.output.getvalue()
+
+
+def test_resuming_with_another_architecture_names_both(uninterrupted):
+    config = dataclasses.replace(_config(), preset="wider")
+    config = config_lib.override(config, "model.deterministic_channels", 24)
+    with pytest.raises(ValueError, match=r"another architecture.*deterministic_channels 16 \(checkpoint\) against 24"):
+        _train(uninterrupted[0], config=config, resume=True)
+
+
+def test_a_loss_that_is_not_finite_stops_the_run_by_name(tmp_path):
+    config = config_lib.override(_config(), "optimizer.learning_rate", 1e38)
+    with pytest.raises(loop.NonFiniteLossError, match=r"step \d: the loss is not finite: .*= (nan|inf).*checkpoint"):
+        _train(tmp_path / "run", config=config)
+    assert run_folder.read_metrics(tmp_path / "run")[-1]["kind"] == "non_finite"
+
+
+def test_bad_data_leaves_no_run_folder_behind(tmp_path):
+    def missing():
+        raise schema.DataError("data folder x does not exist")
+
+    with pytest.raises(schema.DataError, match="does not exist"):
+        loop.train(loop.Job(config=_config(), folder=tmp_path / "run", open_recording=missing), Interrupting())
+    assert not (tmp_path / "run").exists()
+
+
+def test_expected_batch_is_what_the_pipeline_makes():
+    from muvo_jax.data import pipeline, prepare
+
+    recording = MemoryRecording()
+    config = prepare.adapt(_config(), recording).config
+    batch = next(pipeline.train_batches(pipeline.Frames(recording, config), seed=0, batch=2))
+    expected = preparation.expected_batch(config, 2, rewards=False)
+    assert preparation.shapes_of(batch) == expected
+
+
+def test_accumulated_micro_batches_count_as_one_step():
+    config = config_lib.override(_config(), "optimizer.accumulate", 3)
+    assert loop.windows_per_step(config) == 6
+    assert jnp.int32(loop.windows_per_step(_config())) == 2

@@ -13,7 +13,7 @@ import time
 import traceback
 import warnings
 from collections.abc import Callable, Iterable, Sequence
-from typing import Annotated, Any, TypeVar
+from typing import Any, TypeVar
 
 import jax
 import tyro
@@ -28,9 +28,9 @@ EXPECTED_ERRORS = (ValueError, OSError, ArithmeticError)  # DataError, Checkpoin
 _Options = TypeVar("_Options")
 
 
-def option(metavar: str, default: str = "preset's", of: type = str):
-    """The type of an option that may be left out (None); the help shows what then happens instead of "None"."""
-    return Annotated[of | None, tyro.conf.arg(metavar=metavar, help_behavior_hint=f"(default: {default})")]
+def shown(metavar: str, default: str = "preset's"):
+    """How the help shows an option whose default is None: what to write, and what happens when it is left out."""
+    return tyro.conf.arg(metavar=metavar, help_behavior_hint=f"(default: {default})")
 
 
 def run(options_type: type[_Options], work: Callable[[_Options, screen.Screen], Any], *, program: str,
@@ -54,7 +54,7 @@ def run(options_type: type[_Options], work: Callable[[_Options, screen.Screen], 
     options = tyro.cli(options_type, prog=f"python -m muvo_jax.{program}", args=arguments, description=description)
     show = screen.Screen()
     with warnings.catch_warnings():
-        warnings.showwarning = lambda message, *_, **__: show.warn(str(message))
+        warnings.showwarning = lambda message, *_, **__: show.warn(str(message))  # type: ignore[assignment]
         use_compilation_cache()
         try:
             work(options, show)

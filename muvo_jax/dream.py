@@ -35,23 +35,23 @@ class Options:
     """The run's folder."""
     checkpoint: str = "latest"
     """latest, best (validation loss) or a step."""
-    data: command_line.option("PATH", "the run's") = None
+    data: Annotated[str | None, command_line.shown("PATH", "the run's")] = None
     """Another recording than the one that the run was trained on."""
-    split: command_line.option("NAME", "the first validation split") = None
+    split: Annotated[str | None, command_line.shown("NAME", "the first validation split")] = None
     """Where to look for a sequence."""
-    sequence: command_line.option("NAME", "the longest of the split") = None
+    sequence: Annotated[str | None, command_line.shown("NAME", "the longest of the split")] = None
     """Name of the recorded run."""
-    start: command_line.option("N", "middle of the sequence", of=int) = None
+    start: Annotated[int | None, command_line.shown("N", "middle of the sequence")] = None
     """First frame to observe, counted from the sequence's start."""
-    context: command_line.option("N", "the run's", of=int) = None
+    context: Annotated[int | None, command_line.shown("N", "the run's")] = None
     """Frames to observe."""
-    horizon: command_line.option("N", "the run's", of=int) = None
+    horizon: Annotated[int | None, command_line.shown("N", "the run's")] = None
     """Frames to imagine."""
     branches: int = 1
     """Futures to sample; 1 takes the mean of each latent."""
     seed: int = 0
     """Of the sampled futures."""
-    out: command_line.option("PATH", "RUN/dreams", of=pathlib.Path) = None
+    out: Annotated[pathlib.Path | None, command_line.shown("PATH", "RUN/dreams")] = None
     """Where to write."""
 
 

@@ -44,19 +44,19 @@ class Options:
     """latest, best (validation loss) or a step."""
     splits: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME ...", help_behavior_hint="(default: all)")] = ()
     """Which ones to judge."""
-    data: command_line.option("PATH", "the run's") = None
+    data: Annotated[str | None, command_line.shown("PATH", "the run's")] = None
     """Another recording than the one that the run was trained on."""
-    context: command_line.option("N", "the run's", of=int) = None
+    context: Annotated[int | None, command_line.shown("N", "the run's")] = None
     """Frames to observe."""
-    horizon: command_line.option("N", "the run's", of=int) = None
+    horizon: Annotated[int | None, command_line.shown("N", "the run's")] = None
     """Frames to imagine."""
-    windows: command_line.option("N", "the run's", of=int) = None
+    windows: Annotated[int | None, command_line.shown("N", "the run's")] = None
     """At most so many windows of a split, evenly spread; 0 for all."""
-    batch: command_line.option("N", "the run's", of=int) = None
+    batch: Annotated[int | None, command_line.shown("N", "the run's")] = None
     """Windows at a time."""
-    chamfer_points: command_line.option("N", "the run's", of=int) = None
+    chamfer_points: Annotated[int | None, command_line.shown("N", "the run's")] = None
     """Points of each frame that the Chamfer distance looks at; 0 for all."""
-    sampled: command_line.option("{True,False}", "the run's", of=bool) = None
+    sampled: Annotated[bool | None, command_line.shown("{True,False}", "the run's")] = None
     """Draw the latents instead of taking their means."""
 
 

@@ -8,6 +8,7 @@ import shlex
 import sys
 from typing import Annotated, Any
 
+import numpy as np
 import tyro
 
 from muvo_jax import command_line, dream, evaluate, presets
@@ -31,38 +32,38 @@ class Options:
     A flag beats the preset; --set reaches every other setting. Everything lands in RUNS_DIR/NAME.
     """
 
-    preset: command_line.option("NAME", "town") = None
+    preset: Annotated[str | None, command_line.shown("NAME", "town")] = None
     """Named configuration: town (small), tiny (for tests), paper (camera and lidar at the paper's size),
     paper-occupancy (with voxels)."""
-    fusion: command_line.option("NAME") = None
+    fusion: Annotated[str | None, command_line.shown("NAME")] = None
     """How camera and lidar are fused: tr (transformer)."""
-    data: command_line.option("PATH") = None
+    data: Annotated[str | None, command_line.shown("PATH")] = None
     """"town" (built in) or the folder of a recording; its kind is recognised."""
-    name: command_line.option("NAME", "made of data, preset and fusion") = None
+    name: Annotated[str | None, command_line.shown("NAME", "made of data, preset and fusion")] = None
     """Of the run."""
     runs_dir: pathlib.Path = pathlib.Path("runs")
     """Where runs are kept."""
     resume: tyro.conf.FlagCreatePairsOff[bool] = False
     """Go on with the run of that name from its newest readable checkpoint, with the settings it was started with."""
-    steps: command_line.option("N", of=int) = None
+    steps: Annotated[int | None, command_line.shown("N")] = None
     """Updates of the whole run. The learning rate follows a schedule over all of them."""
-    batch: command_line.option("N", of=int) = None
+    batch: Annotated[int | None, command_line.shown("N")] = None
     """Windows per micro-batch, over all devices."""
-    accumulate: command_line.option("N", of=int) = None
+    accumulate: Annotated[int | None, command_line.shown("N")] = None
     """Micro-batches per update."""
-    frames: command_line.option("N", of=int) = None
+    frames: Annotated[int | None, command_line.shown("N")] = None
     """Frames of a training window."""
-    stride: command_line.option("N", of=int) = None
+    stride: Annotated[int | None, command_line.shown("N")] = None
     """Recorded frames from one frame of a window to the next."""
-    context: command_line.option("N", of=int) = None
+    context: Annotated[int | None, command_line.shown("N")] = None
     """Frames that evaluation observes."""
-    horizon: command_line.option("N", of=int) = None
+    horizon: Annotated[int | None, command_line.shown("N")] = None
     """Frames that evaluation imagines after them."""
-    learning_rate: command_line.option("RATE", of=float) = None
+    learning_rate: Annotated[float | None, command_line.shown("RATE")] = None
     """Peak of the schedule."""
-    seed: command_line.option("N", of=int) = None
+    seed: Annotated[int | None, command_line.shown("N")] = None
     """Of initialisation, order of the data and sampling."""
-    parallel: command_line.option("{auto,pmap,shard_map}") = None
+    parallel: Annotated[str | None, command_line.shown("{auto,pmap,shard_map}")] = None
     """How devices share a batch: auto takes shard_map where there is more than one."""
     evaluate: bool = True
     """Judge the trained model on every split and draw a dream at the end."""
@@ -133,7 +134,7 @@ def draw_preview(folder: pathlib.Path, validator: validation.Validator, variable
     batch, frames = validator.example(split, variables)
     config = validator.config
     sheets.write_dream(folder, sheets.views_of_batch(batch, 0), {"world model": sheets.views_of_frames(frames, 0)},
-                       batch.action[0], sheets.Scene.of(config), context=config.data.context,
+                       np.asarray(batch.action[0]), sheets.Scene.of(config), context=config.data.context,
                        title=f"{config.model.variant}  {name}  {split}", name=f"{name}_{split}", animate=False)
     draw_curves(folder.parent)
 

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import dataclasses
+from typing import Any
+
 import flax.struct
 import numpy as np
 
@@ -58,7 +61,7 @@ class TrainingMean:
 
     def add(self, batch: types.Batch) -> TrainingMean:
         """With all frames of a batch."""
-        sums = {"frames": batch.batch_size * batch.frames}
+        sums: dict[str, Any] = {"frames": batch.batch_size * batch.frames}
         if batch.image is not None:
             sums["image"] = np.asarray(batch.image).sum(axis=(0, 1), dtype=np.float64)
         if batch.range_view is not None:
@@ -71,8 +74,8 @@ class TrainingMean:
             sums["occupied"] = (occupancy == types.OCCUPANCY_OCCUPIED).sum(axis=(0, 1), dtype=np.int64)
             sums["known"] = (occupancy != types.OCCUPANCY_UNKNOWN).sum(axis=(0, 1), dtype=np.int64)
         before = {name: getattr(self, name) for name in sums}
-        return self.replace(**{name: value if before[name] is None else before[name] + value
-                               for name, value in sums.items()})
+        return dataclasses.replace(self, **{name: value if before[name] is None else before[name] + value
+                                            for name, value in sums.items()})
 
     def prediction(self) -> Frames:
         """The mean frame: {"image": float32 [H, W, 3] in [0, 1], "range_view": float32 [Hr, Wr, 4], "occupancy": bool}.
@@ -89,11 +92,11 @@ class TrainingMean:
         mean: Frames = {}
         if self.image is not None:
             mean["image"] = (self.image / (255.0 * self.frames)).astype(np.float32)
-        if self.range_view is not None:
+        if self.range_view is not None and self.returned is not None:
             hole = np.array([0.0, 0.0, 0.0, types.RANGE_NO_RETURN_M])
-            returns = 2 * self.returned > self.frames
+            returns = np.greater(2 * self.returned, self.frames)
             values = self.range_view / np.maximum(self.returned, 1)[..., None]
             mean["range_view"] = np.where(returns[..., None], values, hole).astype(np.float32)
-        if self.occupied is not None:
+        if self.occupied is not None and self.known is not None:
             mean["occupancy"] = 2 * self.occupied > self.known
         return mean

@@ -9,7 +9,7 @@ from muvo_jax import types
 PSNR_LIMIT_DB = 100.0
 
 
-def frame_psnr_db(prediction: types.Array, target: types.Array) -> types.Array:
+def frame_psnr_db(prediction: types.ArrayLike, target: types.ArrayLike) -> types.Array:
     """PSNR in decibels at range 1, at most 100 (identical frames would have none).
 
     Args:

@@ -1,8 +1,8 @@
 """The evaluation protocol: observe the context, imagine the horizon under the recorded actions, score every frame.
 
-Scores are kept per step and averaged, for the model and beside it for two baselines: copy-last (the last
-observed frame, of imagined steps only) and training mean. A frame for which a score is undefined is counted and left out; what is
-undefined as a whole is NaN, never 0. BatchNorm runs on its running statistics.
+Scores are kept per step and averaged, for the model and beside it for two baselines: copy-last (the last observed
+frame, of imagined steps only) and training mean. A frame for which a score is undefined is counted and left out; what
+is undefined as a whole is NaN, never 0. BatchNorm runs on its running statistics.
 """
 
 from __future__ import annotations
@@ -87,10 +87,10 @@ class Tally:
         """Scores frames [B, steps, ...] against the recorded ones; a modality that either lacks is not scored."""
         present = [head for head in HEADS if head in prediction and getattr(truth, head) is not None]
         self._seen.update(present)
-        if "image" in present:
+        if "image" in present and truth.image is not None:
             values = np.asarray(image.frame_psnr_db(prediction["image"], truth.image))
             self._means["psnr_db"] = self._means["psnr_db"].add(values)
-        if "range_view" in present:
+        if "range_view" in present and truth.range_view is not None:
             distances = points.frame_chamfer_m(prediction["range_view"], truth.range_view, seed=seed,
                                                return_threshold_m=threshold_m, points=self._evaluation.chamfer_points)
             self._means["chamfer_m"] = self._means["chamfer_m"].add(distances)

@@ -10,6 +10,7 @@ from collections.abc import Mapping
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 
 from muvo_jax import config as config_lib
 from muvo_jax import types
@@ -53,24 +54,24 @@ def loss_sums(predictions: types.Predictions, batch: types.Batch, observed: type
     Raises:
       ValueError: where a head has no target or lacks a scale.
     """
-    _check_heads(predictions, batch, model.heads)
+    targets = _checked_targets(predictions, batch, model.heads)
     sums: dict[str, Any] = {"kl": kl.balanced_kl_sums(observed.posterior, observed.prior, balance=loss.kl_balance,
                                                       numerics=model.numerics)}
     if "action" in model.heads:
-        sums["action"] = regression.l1_sums(predictions["action"][1], batch.action)
+        sums["action"] = regression.l1_sums(predictions["action"][1], targets["action"])
     if "image" in model.heads:
-        for scale, target in labels.image_labels(batch.image).items():
+        for scale, target in labels.image_labels(targets["image"]).items():
             sums[f"image_{scale}"] = regression.l1_sums(predictions["image"][scale], target)
     if "range_view" in model.heads:
-        sums |= _range_view_sums(predictions["range_view"], batch.range_view, keys, model, loss)
+        sums |= _range_view_sums(predictions["range_view"], targets["range_view"], keys, model, loss)
     if "occupancy" in model.heads:
-        for scale, target in labels.occupancy_labels(batch.occupancy).items():
+        for scale, target in labels.occupancy_labels(targets["occupancy"]).items():
             sums[f"occupancy_{scale}"] = scal.occupancy_sums(predictions["occupancy"][scale], target,
                                                              loss.occupancy_unknown == "empty")
     return sums
 
 
-def _range_view_sums(predictions: Mapping[int, types.Array], range_view: types.ArrayLike, keys: types.Array,
+def _range_view_sums(predictions: Mapping[int, types.Array], range_view: types.Array, keys: types.Array,
                      model: config_lib.ModelConfig, loss: config_lib.LossConfig) -> dict[str, regression.MeanSums]:
     sums = {}
     for scale, target in labels.range_view_labels(range_view).items():
@@ -91,7 +92,7 @@ def combine(sums: Mapping[str, Any], weights: Mapping[str, float]) -> dict[str, 
     Raises:
       ValueError: where a term was computed that has no weight, or a weighted term was not computed.
     """
-    terms = {}
+    terms: dict[str, types.Array] = {}
     for name, value in sums.items():
         if isinstance(value, scal.OccupancySums):
             scale = name.rsplit("_", 1)[1]
@@ -103,7 +104,8 @@ def combine(sums: Mapping[str, Any], weights: Mapping[str, float]) -> dict[str, 
     if missing or unknown:
         raise ValueError(f"losses: weighted but not computed {missing}, computed but without a weight {unknown}; "
                          f"weights are known for {sorted(weights)}.")
-    return {name: terms[name] for name in used} | {"total": sum(weight * terms[name] for name, weight in used.items())}
+    weighted = [weight * terms[name] for name, weight in used.items()]
+    return {name: terms[name] for name in used} | {"total": sum(weighted, jnp.float32(0.0))}
 
 
 def losses(predictions: types.Predictions, batch: types.Batch, observed: types.Observed, *,
@@ -119,7 +121,10 @@ def losses(predictions: types.Predictions, batch: types.Batch, observed: types.O
     return combine(sums, term_weights(loss, model.heads))
 
 
-def _check_heads(predictions: types.Predictions, batch: types.Batch, heads: tuple[str, ...]) -> None:
+def _checked_targets(predictions: types.Predictions, batch: types.Batch,
+                     heads: tuple[str, ...]) -> dict[str, types.Array]:
+    """{head: target [B, T, ...]}, after checking that each head was predicted at its scales and has a target."""
+    targets = {}
     for head in heads:
         if head not in predictions:
             raise ValueError(f"losses: the model has the head {head!r}, the predictions have {sorted(predictions)}.")
@@ -129,3 +134,5 @@ def _check_heads(predictions: types.Predictions, batch: types.Batch, heads: tupl
         scales = labels.SCALES if head in _SCALED_TERMS else (1,)
         if set(predictions[head]) != set(scales):
             raise ValueError(f"losses: head {head!r} predicts scales {sorted(predictions[head])}, expected {scales}.")
+        targets[head] = jnp.asarray(getattr(batch, head))
+    return targets

@@ -10,9 +10,7 @@ from __future__ import annotations
 
 import base64
 import dataclasses
-import hashlib
 import importlib.metadata
-import json
 import logging
 import os
 import pathlib
@@ -26,11 +24,10 @@ import orbax.checkpoint as ocp
 from muvo_jax import config as config_lib
 from muvo_jax import types
 from muvo_jax.model import world_model
+from muvo_jax.training import integrity
 
 SCHEMA_VERSION = 1
-CHECKSUM_FILE = "checksums.json"
 FOLDER = "checkpoints"
-DAMAGED_FOLDER = "damaged_checkpoints"
 _PACKAGES = ("muvo_jax", "jax", "jaxlib", "flax", "optax", "orbax-checkpoint", "numpy")
 _preservation = ocp.checkpoint_managers
 
@@ -130,15 +127,15 @@ class Checkpoints:
         folder = self.folder / str(step)
         try:
             if folder.exists():  # an interrupted or damaged save of the same step
-                set_aside(self.run_folder, [step])
+                integrity.set_aside(folder, self.run_folder)
                 self._manager.reload()
             self._manager.save(step, args=items, metrics=None if score is None else {"score": score}, force=True)
             self._manager.wait_until_finished()
-            _write_checksums(folder)
+            integrity.seal(folder)
         except Exception as error:  # Orbax and TensorStore raise OSError, ValueError or RuntimeError for a full disk
             shutil.rmtree(folder, ignore_errors=True)
             self._discard_partial_saves()
-            kept = [str(other) for other in self.steps() if damage(self.folder / str(other)) is None]
+            kept = [str(other) for other in self.steps() if integrity.damage(self.folder / str(other)) is None]
             raise CheckpointError(
                 f"checkpoint of step {step} could not be written to {self.folder}: {_first_line(error)}. "
                 f"Is the disk full? Readable checkpoints: {', '.join(kept) or 'none'}. Free some space and go on "
@@ -167,7 +164,7 @@ class Checkpoints:
         warnings: list[str] = []
         abstract = jax.tree.map(_abstract, like)
         for step in reversed(self.steps()):
-            reason = damage(self.folder / str(step))
+            reason = integrity.damage(self.folder / str(step))
             if reason is None:
                 meta = read_meta(self.folder / str(step))
                 check_architecture(config, config_lib.Config.from_dict(meta["config"]), str(self.folder / str(step)))
@@ -216,10 +213,10 @@ def load_run(run: str | os.PathLike, which: int | str = "latest") -> LoadedRun:
         state = "has no checkpoint yet" if folder.is_dir() else "does not exist"
         raise CheckpointError(f"{folder} {state}; expected {checkpoints}/STEP. Train first: python -m muvo_jax.train.")
     candidates = _candidates(checkpoints, found, which)
-    warnings = []
+    warnings: list[str] = []
     for step in candidates:
         path = checkpoints / str(step)
-        reason = damage(path)
+        reason = integrity.damage(path)
         if reason is None:
             meta = read_meta(path)
             config = config_lib.Config.from_dict(meta["config"])
@@ -241,44 +238,11 @@ def check_architecture(wanted: config_lib.Config, stored: config_lib.Config, whe
     if wanted.model == stored.model:
         return
     ours, theirs = dataclasses.asdict(wanted.model), dataclasses.asdict(stored.model)
-    fields = [f"{name} {theirs[name]!r} (checkpoint) against {ours[name]!r} (asked for)"
+    fields = [f"{name} {theirs[name]!r} (stored) against {ours[name]!r} (asked for)"
               for name in ours if ours[name] != theirs[name]]
     raise ValueError(f"{where} holds another architecture: it is {stored.model.variant} of preset {stored.preset!r}, "
                      f"asked for is {wanted.model.variant} of preset {wanted.preset!r}. Different: "
                      f"{'; '.join(fields)}. Use the run's own settings, or a new --name.")
-
-
-def damage(folder: pathlib.Path) -> str | None:
-    """Why a checkpoint folder cannot be trusted, or None where every file is as it was written."""
-    try:
-        listed = json.loads((folder / CHECKSUM_FILE).read_text(encoding="utf-8"))["files"]
-    except FileNotFoundError:
-        return f"it has no {CHECKSUM_FILE}, so saving was interrupted"
-    except (OSError, ValueError, KeyError, TypeError):
-        return f"its {CHECKSUM_FILE} cannot be read"
-    for name, expected in listed.items():
-        path = folder / name
-        if not path.is_file():
-            return f"{name} is missing"
-        if _sha256(path) != expected:
-            return f"{name} has changed since it was written ({path.stat().st_size} bytes now)"
-    return None
-
-
-def set_aside(run_folder: str | os.PathLike, steps: list[int]) -> list[pathlib.Path]:
-    """Moves checkpoints out of the way (RUN/damaged_checkpoints), so that training can write these steps again."""
-    run_folder = pathlib.Path(run_folder)
-    moved = []
-    for step in steps:
-        target = run_folder / DAMAGED_FOLDER / str(step)
-        copy = 1
-        while target.exists():
-            copy += 1
-            target = target.with_name(f"{step}-{copy}")
-        target.parent.mkdir(exist_ok=True)
-        (run_folder / FOLDER / str(step)).rename(target)
-        moved.append(target)
-    return moved
 
 
 def read_meta(folder: pathlib.Path) -> dict[str, Any]:
@@ -311,7 +275,7 @@ def _candidates(checkpoints: pathlib.Path, found: list[int], which: int | str) -
         return newest_first
     if which == "best":
         scores = {step: read_meta(checkpoints / str(step))["score"] for step in newest_first
-                  if damage(checkpoints / str(step)) is None}
+                  if integrity.damage(checkpoints / str(step)) is None}
         scored = {step: score for step, score in scores.items() if score is not None}
         return [max(scored, key=scored.get)] if scored else newest_first  # type: ignore[arg-type]
     if which not in found:
@@ -338,21 +302,6 @@ def _abstract(leaf):
 def _steps(folder: pathlib.Path) -> list[int]:
     return sorted(int(path.name) for path in folder.iterdir() if path.is_dir() and path.name.isdigit()) \
         if folder.is_dir() else []
-
-
-def _write_checksums(folder: pathlib.Path) -> None:
-    files = {str(path.relative_to(folder)): _sha256(path) for path in sorted(folder.rglob("*")) if path.is_file()}
-    partial = folder / (CHECKSUM_FILE + ".part")
-    with partial.open("w", encoding="utf-8") as file:
-        json.dump({"schema_version": SCHEMA_VERSION, "files": files}, file, indent=1)
-        file.flush()
-        os.fsync(file.fileno())
-    partial.replace(folder / CHECKSUM_FILE)
-
-
-def _sha256(path: pathlib.Path) -> str:
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def _encode(data_state):

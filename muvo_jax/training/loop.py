@@ -9,10 +9,6 @@ import concurrent.futures
 import dataclasses
 import math
 import pathlib
-import resource
-import signal
-import sys
-import threading
 import time
 from collections.abc import Callable, Collection, Iterator, Mapping
 
@@ -21,7 +17,7 @@ import jax
 from muvo_jax import config as config_lib
 from muvo_jax import types
 from muvo_jax.data import pipeline, prepare, schema
-from muvo_jax.training import checkpoint, preparation, run_folder, screen, validation
+from muvo_jax.training import checkpoint, host, integrity, preparation, run_folder, screen, validation
 
 Preview = Callable[[pathlib.Path, validation.Validator, types.Variables, str], None]
 
@@ -68,12 +64,14 @@ def train(job: Job, show: screen.Screen) -> Outcome:
     """Trains to `train.steps`, or until the user stops it.
 
     Raises:
-      FileExistsError: where the run exists and `resume` is not asked for.
-      DataError, ValueError: for data or settings that do not fit.
+      FileExistsError, FileNotFoundError: where the run exists and `resume` is not asked for, or the other way round.
+      DataError, ValueError: for data or settings that do not fit, or that make another architecture than the run's.
       CheckpointError: where a checkpoint cannot be written, or none can be read.
       NonFiniteLossError: where the loss is not finite.
     """
-    if not job.resume:
+    if job.resume:
+        checkpoint.check_architecture(job.config, run_folder.read_config(job.folder), str(job.folder))
+    else:
         run_folder.check_new(job.folder, job.resume_command)
     with concurrent.futures.ThreadPoolExecutor(1, "preparation") as background:
         early = background.submit(_prepare_early, job.config)
@@ -161,8 +159,9 @@ def _resume(job: Job, show: screen.Screen, keeper: checkpoint.Checkpoints, confi
     for text in restored.warnings:
         show.warn(text)
     later = [step for step in keeper.steps() if step > restored.step]
-    for path in checkpoint.set_aside(job.folder, later):
-        show.warn(f"moved the damaged checkpoint to {path}.")
+    for step in later:
+        moved = integrity.set_aside(keeper.folder / str(step), job.folder)
+        show.warn(f"moved the damaged checkpoint to {moved}.")
     keeper.reload()
     run_folder.forget_after(job.folder, restored.step)
     show.field("resumed", f"from step {restored.step}")
@@ -184,7 +183,7 @@ class _Run:
         settings, pace = self.config.train, screen.Pace()
         feed = pipeline.prefetch_to_device(_Placed(source, self.ready.step.place))
         unchecked: tuple[int, Mapping] | None = None
-        with feed, _StopRequest() as stop:
+        with feed, host.StopRequest() as stop:
             self.show.start(settings.steps, self.done)
             while self.done < settings.steps and not stop.requested:
                 start_s, waited_s = time.perf_counter(), feed.waited_s
@@ -285,7 +284,7 @@ class _Run:
         if steady_s:
             median_s, age_s = steady_s[len(steady_s) // 2], time.perf_counter() - self.job.started_s
             self.show.line(f"{len(self.step_times_s)} steps, median {median_s:.3f} s each; peak memory "
-                           f"{peak_memory_gib():.2f} GiB; {screen.duration_text(age_s)} since the start")
+                           f"{host.peak_memory_gib():.2f} GiB; {screen.duration_text(age_s)} since the start")
         elif not self.step_times_s:
             self.show.line(f"nothing left to train: step {self.done} of {total} is reached (more with --steps).")
 
@@ -309,12 +308,6 @@ def _due(step: int, settings: config_lib.TrainConfig) -> _Due:
                 every(settings.preview_every))
 
 
-def peak_memory_gib() -> float:
-    """The most memory this process has held so far."""
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    return peak / 2**30 if sys.platform == "darwin" else peak / 2**20
-
-
 class _Placed:
     """Batches split and uploaded for the training step; knows its source's position."""
 
@@ -329,25 +322,3 @@ class _Placed:
 
     def get_state(self):
         return self._source.get_state()
-
-
-class _StopRequest:
-    """Turns the first SIGINT or SIGTERM into a wish that the loop sees between two steps; a second one interrupts."""
-
-    def __init__(self):
-        self.requested = False
-        self._before: dict = {}
-
-    def __enter__(self) -> _StopRequest:
-        if threading.current_thread() is threading.main_thread():
-            self._before = {number: signal.signal(number, self._handle) for number in (signal.SIGINT, signal.SIGTERM)}
-        return self
-
-    def __exit__(self, *_) -> None:
-        for number, handler in self._before.items():
-            signal.signal(number, handler)
-
-    def _handle(self, *_) -> None:
-        if self.requested:
-            raise KeyboardInterrupt
-        self.requested = True

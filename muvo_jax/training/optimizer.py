@@ -91,7 +91,7 @@ def _group(leaf: types.Array) -> str:
 
 
 def make_optimizer(config: config_lib.OptimizerConfig, total_steps: int) -> optax.GradientTransformation:
-    """AdamW on packed parameters, with both schedules, after clipping by the global norm where `clip_norm` is positive."""
+    """AdamW on packed parameters with both schedules, after clipping by the global norm if `clip_norm` > 0."""
     adamw = optax.inject_hyperparams(optax.adamw, static_args=("mask",))(
         learning_rate=learning_rate(config, total_steps), b1=beta1(config, total_steps), b2=config.beta2,
         eps=config.epsilon, weight_decay=config.weight_decay, mask={"decayed": True, "undecayed": False})

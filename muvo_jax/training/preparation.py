@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 import time
+from typing import Any
 
 import jax
 import numpy as np
@@ -56,7 +57,10 @@ def expected_batch(config: config_lib.Config, windows: int, *, rewards: bool = T
     """
     model, prefix = config.model, (windows, config.data.frames)
 
-    def timed(dtype, *shape):
+    def shape(dtype, *sizes) -> Any:
+        return jax.ShapeDtypeStruct((windows, *sizes), dtype)
+
+    def timed(dtype, *shape) -> Any:
         return jax.ShapeDtypeStruct((*prefix, *shape), dtype)
 
     geometry = model.range_view
@@ -67,8 +71,7 @@ def expected_batch(config: config_lib.Config, windows: int, *, rewards: bool = T
         route_map=timed(np.uint8, ROUTE_MAP_PX, ROUTE_MAP_PX) if model.route else None,
         speed_mps=timed(np.float32) if model.speed else None,
         reward=timed(np.float32) if rewards else None, is_terminal=timed(np.bool_) if rewards else None,
-        intrinsics=jax.ShapeDtypeStruct((windows, 3, 3), np.float32),
-        camera_to_ego=jax.ShapeDtypeStruct((windows, 4, 4), np.float32))
+        intrinsics=shape(np.float32, 3, 3), camera_to_ego=shape(np.float32, 4, 4))
 
 
 def shapes_of(batch: types.Batch) -> types.Batch:
@@ -97,14 +100,13 @@ def prepare(config: config_lib.Config, batch_shapes: types.Batch) -> Prepared:
     state = jax.block_until_ready(parallel_lib.place_state(step.plan, state))
     initialised_s = time.perf_counter()
     placed = jax.tree.map(lambda leaf: np.zeros(leaf.shape, leaf.dtype), batch_shapes)
-    compiled = step.compiled.lower(state, step.place(placed)).compile()
+    jitted: Any = step.compiled
+    compiled = jitted.lower(state, step.place(placed)).compile()
     return Prepared(model, state, dataclasses.replace(step, compiled=compiled), batch_shapes,
                     initialised_s - start_s, time.perf_counter() - initialised_s)
 
 
 def recompile(prepared: Prepared, config: config_lib.Config, batch_shapes: types.Batch) -> Prepared:
     """`prepared` where it already fits, else a new one for what the data turned out to be."""
-    same = (prepared.model.config == config.model
-            and jax.tree.structure(prepared.batch_shapes) == jax.tree.structure(batch_shapes)
-            and jax.tree.leaves(prepared.batch_shapes) == jax.tree.leaves(batch_shapes))
+    same = prepared.model.config == config.model and prepared.batch_shapes == batch_shapes
     return prepared if same else prepare(config, batch_shapes)

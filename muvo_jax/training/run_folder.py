@@ -28,13 +28,13 @@ class RunFolder:
         self._metrics = (self.path / METRICS_FILE).open("a", encoding="utf-8")
 
     def log(self, record: Mapping[str, Any]) -> None:
-        """Appends one record; numbers also go to TensorBoard under `kind/name`. Not-a-number is written as null."""
+        """Appends one record; finite numbers also go to TensorBoard as `kind/name`. What is not finite is null."""
         clean = {name: _json_number(value) for name, value in record.items()}
         self._metrics.write(json.dumps(clean) + "\n")
         self._metrics.flush()
         prefix = "/".join(str(record[name]) for name in ("kind", "split") if name in record)
         for name, value in record.items():
-            if name != "step" and isinstance(value, (int, float)) and not isinstance(value, bool):
+            if name != "step" and isinstance(value, (int, float)) and math.isfinite(value):
                 self._events.add_scalar(f"{prefix}/{name}", value, record["step"])
 
     def close(self) -> None:

@@ -136,8 +136,8 @@ def gradient_body(model: world_model.WorldModel, config: config_lib.Config) -> C
             return gradients, batch_stats, metrics
 
         def scanned(carry, inputs):
-            batch_stats, sums = carry
-            batch_stats, *more = micro_step(state, batch_stats, *inputs, axis_name)
+            (batch_stats, sums), (micro_batch, index) = carry, inputs
+            batch_stats, *more = micro_step(state, batch_stats, micro_batch, index, axis_name)
             return (batch_stats, jax.tree.map(jnp.add, sums, more)), None
 
         _, *shapes = jax.eval_shape(lambda: micro_step(state, state.batch_stats, batch[0], 0, axis_name))
@@ -180,14 +180,14 @@ def forward(params: Any, batch_stats: Any, batch: types.Batch, keys: types.Array
     variables = {"params": params, "batch_stats": batch_stats}
     observe = functools.partial(rollout.observe_window, model, train=train, axis_name=axis_name)
     observed, batch_stats = maybe_remat(observe)(variables, batch, keys)
-    predictions = {}
+    predictions: types.Predictions = {}
     for head in model.config.heads:
         decode = functools.partial(model.decode, heads=(head,))
         predictions |= maybe_remat(decode)(variables, observed.states.features)
     terms = total.losses(predictions, batch, observed, model=model.config, loss=config.loss, keys=keys,
                          axis_name=axis_name)
     metrics = dict(terms)
-    if "image" in predictions:
+    if batch.image is not None and "image" in predictions:
         metrics["psnr_db"] = _mean(image_metrics.frame_psnr_db(predictions["image"][1], batch.image), axis_name)
     return terms["total"], (metrics, batch_stats)
 

@@ -36,6 +36,24 @@ class View:
 
 
 @dataclasses.dataclass(frozen=True)
+class Moment:
+    """One frame of a dream.
+
+    Attributes:
+      truth, dream: what was recorded and what the model says.
+      badge: "observed" or "imagined".
+      time_s: since the last observed frame.
+      action: float [2], applied from this frame to the next.
+    """
+
+    truth: View
+    dream: View
+    badge: str
+    time_s: float
+    action: np.ndarray
+
+
+@dataclasses.dataclass(frozen=True)
 class Scene:
     """What all frames of a picture share: the sensors' geometry, the pace and the ranges of the colour scales."""
 
@@ -84,39 +102,37 @@ def dream_frame(columns: Sequence[tuple[str, View]], scene: Scene, *, badge: str
     return canvas.margin(canvas.frame(canvas.margin(canvas.stack(parts, axis=0), 8), accent, 2), 6)
 
 
-def sensor_sheet(truth: Sequence[View], dream: Sequence[View], badges: Sequence[str], times_s: Sequence[float],
-                 actions: np.ndarray, scene: Scene, *, title: str) -> np.ndarray | None:
+def sensor_sheet(moments: Sequence[Moment], scene: Scene, *, title: str) -> np.ndarray | None:
     """Camera and range image, one moment a row: truth left, world model right. None where there is neither."""
     rows = []
-    for true_view, dreamt_view, badge, time_s, action in zip(truth, dream, badges, times_s, actions, strict=True):
-        pairs = [canvas.stack(list(pair), axis=1) for pair in zip(_wide_panels(true_view, scene),
-                                                                  _wide_panels(dreamt_view, scene), strict=False)]
+    for moment in moments:
+        pairs = [canvas.stack(list(pair), axis=1) for pair in zip(_wide_panels(moment.truth, scene),
+                                                                  _wide_panels(moment.dream, scene), strict=False)]
         if not pairs:
             return None
         content = canvas.stack(pairs, axis=0, gap=4)
-        rows.append(canvas.stack([_moment(badge, time_s, action, content.shape[0]), content], axis=1))
+        rows.append(canvas.stack([_moment(moment, content.shape[0]), content], axis=1))
     heads = [canvas.blank(20, 132), _heading("truth", WIDE_PX), _heading("world model", WIDE_PX)]
     page = [_heading(title, rows[0].shape[1], 17), canvas.stack(heads, axis=1), *rows,
-            legend(truth[0], scene, rows[0].shape[1], heights=False)]
+            legend(moments[0].truth, scene, rows[0].shape[1], heights=False)]
     return canvas.margin(canvas.stack(page, axis=0, gap=10))
 
 
-def space_sheet(truth: Sequence[View], dream: Sequence[View], badges: Sequence[str], times_s: Sequence[float],
-                scene: Scene, *, title: str) -> np.ndarray | None:
+def space_sheet(moments: Sequence[Moment], scene: Scene, *, title: str) -> np.ndarray | None:
     """Bird's-eye points and voxels, one moment a column: truth above, world model below. None without both."""
     columns = []
-    for true_view, dreamt_view, badge, time_s in zip(truth, dream, badges, times_s, strict=True):
-        pairs = [part for pair in zip(_space_panels(true_view, scene), _space_panels(dreamt_view, scene),
+    for moment in moments:
+        pairs = [part for pair in zip(_space_panels(moment.truth, scene), _space_panels(moment.dream, scene),
                                       strict=False) for part in pair]
         if not pairs:
             return None
-        strip = canvas.tag(f"{badge} {time_s:+.1f} s", canvas.TAG_COLOURS[badge], SQUARE_PX, 12)
+        strip = canvas.tag(f"{moment.badge} {moment.time_s:+.1f} s", canvas.TAG_COLOURS[moment.badge], SQUARE_PX, 12)
         columns.append(canvas.stack([strip, *pairs], axis=0, gap=5))
-    names = [canvas.blank(20, 96)]
-    for what, picture in zip(_space_names(truth[0]), _space_panels(truth[0], scene), strict=True):
+    first, names = moments[0].truth, [canvas.blank(20, 96)]
+    for what, picture in zip(_space_names(first), _space_panels(first, scene), strict=True):
         names += [_row_name(what, who, picture.shape[0]) for who in ("truth", "world model")]
     body = canvas.stack([canvas.stack(names, axis=0, gap=5), *columns], axis=1, gap=8)
-    page = [_heading(title, body.shape[1], 17), body, legend(truth[0], scene, body.shape[1], ranges=False)]
+    page = [_heading(title, body.shape[1], 17), body, legend(first, scene, body.shape[1], ranges=False)]
     return canvas.margin(canvas.stack(page, axis=0, gap=10))
 
 
@@ -154,21 +170,20 @@ def write_dream(folder: str | os.PathLike, truth: Sequence[View], predictions: M
       animate: also write the animation.
     """
     folder = pathlib.Path(folder)
-    badges = ["observed" if frame < context else "imagined" for frame in range(len(truth))]
-    times_s = [(frame - context + 1) * scene.frame_s for frame in range(len(truth))]
+    dream = next(iter(predictions.values()))
+    moments = [Moment(truth[frame], dream[frame], "observed" if frame < context else "imagined",
+                      (frame - context + 1) * scene.frame_s, actions[frame]) for frame in range(len(truth))]
     written = []
     if animate:
-        pictures = [dream_frame([("truth", truth[frame]), *((label, views[frame])
+        pictures = [dream_frame([("truth", moment.truth), *((label, views[frame])
                                                             for label, views in predictions.items())],
-                                scene, badge=badges[frame], caption=f"{times_s[frame]:+.1f} s   {title}",
-                                action=actions[frame]) for frame in range(len(truth))]
+                                scene, badge=moment.badge, caption=f"{moment.time_s:+.1f} s   {title}",
+                                action=moment.action) for frame, moment in enumerate(moments)]
         written.append(canvas.save_gif(folder / f"{name}.gif", pictures, max(scene.frame_s, 0.3)))
-    dream = next(iter(predictions.values()))
     chosen = np.unique(np.linspace(0, len(truth) - 1, min(most_moments, len(truth))).round().astype(int))
-    picked = [[rows[frame] for frame in chosen] for rows in (truth, dream, badges, times_s)]
-    sensors = sensor_sheet(*picked, actions[chosen], scene, title=title)
-    space = space_sheet(*picked, scene, title=title)
-    for suffix, page in (("sensors", sensors), ("space", space)):
+    picked = [moments[frame] for frame in chosen]
+    for suffix, page in (("sensors", sensor_sheet(picked, scene, title=title)),
+                         ("space", space_sheet(picked, scene, title=title))):
         if page is not None:
             written.append(canvas.save_png(folder / f"{name}_{suffix}.png", page))
     return written
@@ -179,11 +194,11 @@ def _heading(text: str, columns: int, size_px: int = 14) -> np.ndarray:
     return canvas.write(strip, text, 1, 0, size_px=size_px)
 
 
-def _moment(badge: str, time_s: float, action: np.ndarray, rows: int) -> np.ndarray:
+def _moment(moment: Moment, rows: int) -> np.ndarray:
     """The left margin of a row: badge, time and action."""
-    strip = canvas.tag(badge, canvas.TAG_COLOURS[badge], 132)
-    clock = canvas.write(canvas.blank(22, 132), f"{time_s:+.1f} s", 11, 2, size_px=15, anchor="lm")
-    block = canvas.stack([strip, clock, panels.action_bars(action, 132)], axis=0, gap=4)
+    strip = canvas.tag(moment.badge, canvas.TAG_COLOURS[moment.badge], 132)
+    clock = canvas.write(canvas.blank(22, 132), f"{moment.time_s:+.1f} s", 11, 2, size_px=15, anchor="lm")
+    block = canvas.stack([strip, clock, panels.action_bars(moment.action, 132)], axis=0, gap=4)
     return block if block.shape[0] >= rows else canvas.stack([block, canvas.blank(rows - block.shape[0], 132)], 0, 0)
 
 

@@ -34,7 +34,7 @@ def make_case(seed=0):
     gaussian = lambda: types.Gaussian(uniform(8), 0.1 + uniform(8))
     state = types.LatentState(uniform(8), uniform(8))
     observed = types.Observed(state, gaussian(), gaussian())
-    return jax.tree.map(jnp.asarray, (predictions, batch, observed)) + (jax.random.split(jax.random.key(0), PREFIX[0]),)
+    return *jax.tree.map(jnp.asarray, (predictions, batch, observed)), jax.random.split(jax.random.key(0), PREFIX[0])
 
 
 def losses(case, model=MODEL, loss=LOSS, axis_name=None):
@@ -86,7 +86,6 @@ def test_reference_numerics_pulls_the_points_of_holes():
 def test_the_loss_does_not_depend_on_how_devices_share_the_batch():
     # Means of per-part values would differ: holes, unknown voxels and SCAL ratios are uneven.
     case = make_case()
-    case[1].occupancy.block_until_ready()
     uneven = case[1].occupancy.at[0].set(255).at[1, 0].set(0)
     case = (case[0], case[1].replace(occupancy=uneven), *case[2:])
     parts = jax.tree.map(lambda leaf: leaf.reshape(2, 2, *leaf.shape[1:]), case)

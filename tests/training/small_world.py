@@ -1,7 +1,7 @@
 """A model with the interface and the randomness of WorldModel, but small enough to compile in seconds; and its batches.
 
-The transition is the real one. The encoder keeps what matters to spreading a batch over devices: convolutions in front of
-a synchronised BatchNorm, and dropout keyed per sample. The decoders are single dense layers.
+The transition is the real one. The encoder keeps what matters to spreading a batch over devices: convolutions in front
+of a synchronised BatchNorm, and dropout keyed per sample. The decoders are single dense layers.
 """
 
 import dataclasses
@@ -64,7 +64,8 @@ class SmallWorld:
         generator = np.random.default_rng(seed)
         fill = lambda leaf: (0.1 * generator.normal(size=leaf.shape)).astype(np.float32)
         unit = lambda leaf: np.ones(leaf.shape, np.float32)
-        return {"params": jax.tree.map(fill, shapes["params"]), "batch_stats": jax.tree.map(unit, shapes["batch_stats"])}
+        return {"params": jax.tree.map(fill, shapes["params"]),
+                "batch_stats": jax.tree.map(unit, shapes["batch_stats"])}
 
     def _example(self):
         batch, state = make_batch(self.config, frames=1), self.initial_state(WINDOWS)
@@ -101,7 +102,7 @@ def head_shapes(config):
 
 
 def make_config(accumulate=1, **model):
-    """The tiny preset for WINDOWS windows an update, with everything random switched on and every loss term computed."""
+    """The tiny preset for WINDOWS windows an update, with everything random and every loss term switched on."""
     config = presets.tiny()
     return dataclasses.replace(
         config,

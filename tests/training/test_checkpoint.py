@@ -17,7 +17,7 @@ import muvo_jax
 from muvo_jax import config as config_lib
 from muvo_jax import presets
 from muvo_jax.model import world_model
-from muvo_jax.training import checkpoint, optimizer, run_folder, state
+from muvo_jax.training import checkpoint, integrity, optimizer, run_folder, state
 
 ROOT = pathlib.Path(muvo_jax.__file__).parents[1]
 
@@ -93,7 +93,7 @@ def _flip_a_byte(folder):
 
 
 def _interrupt(folder):
-    (folder / checkpoint.CHECKSUM_FILE).unlink()
+    (folder / integrity.CHECKSUM_FILE).unlink()
 
 
 def _remove_a_file(folder):
@@ -117,7 +117,7 @@ def test_a_damaged_step_can_be_written_again(tmp_path, fresh, config):
     keeper = checkpoint.Checkpoints(tmp_path)
     keeper.save(2, _at(fresh, 2), config=config)
     _assert_same(keeper.restore_latest(fresh, config).state, _at(fresh, 2))
-    assert (tmp_path / checkpoint.DAMAGED_FOLDER / "2").is_dir()
+    assert (tmp_path / integrity.DAMAGED_FOLDER / "2").is_dir()
 
 
 def test_only_damaged_checkpoints_is_an_error(tmp_path, fresh, config):
@@ -132,7 +132,7 @@ def test_only_damaged_checkpoints_is_an_error(tmp_path, fresh, config):
 def test_another_architecture_is_refused_by_naming_both(tmp_path, fresh, config):
     _save(tmp_path, fresh, config, 1).close()
     other = dataclasses.replace(config, preset="other", model=dataclasses.replace(config.model, embedding_channels=24))
-    with pytest.raises(ValueError, match=r"preset 'tiny'.*preset 'other'.*embedding_channels 16 .*24"):
+    with pytest.raises(ValueError, match=r"preset 'tiny'.*preset 'other'.*embedding_channels 16 \(stored\) against 24"):
         checkpoint.Checkpoints(tmp_path).restore_latest(fresh, other)
 
 

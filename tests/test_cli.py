@@ -1,0 +1,157 @@
+"""The commands as a user meets them: help, wrong options, and one clear line for an expected error."""
+
+import json
+import os
+import pathlib
+import subprocess
+import sys
+
+import pytest
+
+import muvo_jax
+from muvo_jax import command_line, evaluate, presets, train
+from muvo_jax import config as config_lib
+from muvo_jax.training import run_folder, screen
+
+ROOT = pathlib.Path(muvo_jax.__file__).parents[1]
+
+
+@pytest.fixture(autouse=True)
+def no_compilation_cache(monkeypatch):
+    """These tests call the commands inside this process, which must keep its settings."""
+    monkeypatch.setattr(command_line, "use_compilation_cache", lambda: None)
+
+
+def _command(*arguments, cwd=ROOT, **environment):
+    variables = {**os.environ, "JAX_PLATFORMS": "cpu", "PYTHONPATH": str(ROOT), "XLA_FLAGS": "", **environment}
+    return subprocess.run([sys.executable, "-m", *arguments], cwd=cwd, env=variables, capture_output=True, text=True,
+                          timeout=560, check=False)
+
+
+def _main(capsys, *arguments):
+    code = command_line.run(train.Options, train.train, program="train", arguments=arguments)
+    return code, capsys.readouterr()
+
+
+@pytest.mark.parametrize("module", ["train", "evaluate", "dream"])
+def test_help_has_examples_and_every_option_explained(module, capsys):
+    options = {"train": train, "evaluate": evaluate}.get(module) or __import__("muvo_jax.dream").dream
+    with pytest.raises(SystemExit) as ended:
+        command_line.run(options.Options, lambda *_: None, program=module, arguments=["--help"],
+                         examples=options.EXAMPLES)
+    assert ended.value.code == 0
+    text = capsys.readouterr().out
+    assert "Examples:" in text and text.count(f"python -m muvo_jax.{module} ") >= 3
+    assert "None" not in text
+
+
+def test_an_unknown_option_names_its_neighbours(capsys):
+    with pytest.raises(SystemExit) as ended:
+        _main(capsys, "--prest=tiny")
+    assert ended.value.code == 2
+    assert "unknown option --prest; did you mean --preset" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(("arguments", "message"), [
+    (["--preset=towm"], "preset 'towm' is unknown; known are town, tiny, paper, paper-occupancy. Did you mean town?"),
+    (["--fusion=tt"], "model.fusion: 'tt' is unknown; known are tr"),
+    (["--set", "model.dropot=0"], "'dropot' is unknown"),
+    (["--set", "model.dropout"], "expected name=value"),
+    (["--set", "train.steps=many"], "train.steps: got 'many', expected int"),
+    (["--data=/nowhere/at/all"], "data folder /nowhere/at/all does not exist"),
+    (["--name=ghost", "--resume"], "no run to go on with"),
+    (["--parallel=pmpa"], "'pmpa' is unknown"),
+])
+def test_expected_errors_are_one_line_without_traceback(arguments, message, capsys, tmp_path):
+    code, captured = _main(capsys, "--preset=tiny", f"--runs-dir={tmp_path}", *arguments)
+    assert code == 1
+    assert message in captured.err and "Traceback" not in captured.err
+    assert not any(tmp_path.iterdir())
+
+
+def test_the_traceback_is_there_for_who_asks(capsys, tmp_path, monkeypatch):
+    monkeypatch.setenv(command_line.TRACEBACK_VARIABLE, "1")
+    code, captured = _main(capsys, "--data=/nowhere/at/all", f"--runs-dir={tmp_path}")
+    assert code == 1 and "Traceback" in captured.err
+
+
+def test_an_existing_run_is_refused_with_the_command_to_go_on(capsys, tmp_path):
+    run_folder.create(tmp_path / "tiny-tr", presets.tiny(), "")
+    code, captured = _main(capsys, "--preset=tiny", f"--runs-dir={tmp_path}")
+    assert code == 1
+    assert f"python -m muvo_jax.train --name=tiny-tr --resume --runs-dir={tmp_path}" in captured.err
+    assert "--name=SOMETHING_NEW" in captured.err
+
+
+def test_a_flag_beats_the_preset_and_set_reaches_everything():
+    options = train.Options(preset="tiny", steps=7, frames=5, parallel="pmap",
+                            set=("loss.kl=0.5", 'model.heads=["image"]'))
+    config, chosen, folder = train.configure(options)
+    assert (config.train.steps, config.data.frames, config.train.parallel) == (7, 5, "pmap")
+    assert (config.loss.kl, config.model.heads) == (0.5, ("image",))
+    assert set(chosen) == {"train.steps", "data.frames", "train.parallel", "loss.kl", "model.heads"}
+    assert folder == pathlib.Path("runs/tiny-tr")
+
+
+def test_default_names_tell_runs_apart():
+    names = [train.default_name(options) for options in (
+        train.Options(), train.Options(preset="paper", fusion="tr"), train.Options(data="/data/kitti_raw"),
+        train.Options(data="/data/kitti_raw/", preset="tiny"))]
+    assert names == ["town-tr", "paper-tr", "kitti_raw-tr", "kitti_raw-tiny-tr"]
+
+
+def test_resume_takes_the_settings_of_the_run_and_refuses_another_preset(tmp_path):
+    stored = config_lib.override(presets.tiny(), "train.seed", 5)
+    run_folder.create(tmp_path / "r", stored, "")
+    options = train.Options(name="r", runs_dir=tmp_path, resume=True, steps=9)
+    assert train.configure(options)[0] == config_lib.override(stored, "train.steps", 9)
+    with pytest.raises(ValueError, match="was started with preset 'tiny', not 'paper'"):
+        train.configure(train.Options(name="r", runs_dir=tmp_path, resume=True, preset="paper"))
+
+
+def test_evaluating_what_is_not_a_run_is_one_clear_line(capsys, tmp_path):
+    code = command_line.run(evaluate.Options, evaluate.evaluate, program="evaluate", arguments=[str(tmp_path / "none")])
+    assert code == 1
+    assert "does not exist; expected" in capsys.readouterr().err
+
+
+def _scores(value):
+    metric = {"mean": value, "per_step": [value, 2 * value], "frames": 4, "undefined": 1}
+    return {"psnr_db": metric, "chamfer_m": {**metric, "mean": float("nan")}}
+
+
+def test_report_marks_the_best_and_says_nan(tmp_path):
+    phases = {"observed": {"model": _scores(2.0), "training_mean": _scores(1.0)},
+              "imagined": {"model": _scores(1.0), "copy_last": _scores(3.0), "training_mean": _scores(2.0)}}
+    report = {"run": "runs/x", "variant": "RV-WOB-TR", "step": 3, "parameters": 1000, "data": {"name": "town"},
+              "protocol": "p", "training_mean_frames": 9,
+              "splits": {"val_rl": {"windows": 2, "copy_last_unknown_voxels": 5, **phases}}}
+    evaluate.write_report(tmp_path, report)
+    page = (tmp_path / "report.md").read_text()
+    assert "| PSNR (dB) | **2.00** | 1.00 | 4 (1), 4 (1) |" in page
+    assert "| PSNR (dB) | 1.00 | **3.00** | 2.00 |" in page
+    assert "| Chamfer (m) | nan | nan | nan |" in page
+    assert "| PSNR (dB) | copy-last | 3.00 | 6.00 |" in page
+    stored = json.loads((tmp_path / "evaluation.json").read_text())
+    assert stored["splits"]["val_rl"]["imagined"]["model"]["chamfer_m"]["mean"] == "nan"
+    table = evaluate.screen_table("val_rl", "imagined", report["splits"]["val_rl"])
+    assert table.row_count == 2
+
+
+def test_durations_read_well():
+    assert [screen.duration_text(seconds) for seconds in (12.4, 200, 7500, float("nan"))] == [
+        "12 s", "3 min 20 s", "2 h 5 min", "?"]
+
+
+@pytest.mark.slow
+def test_the_whole_job_on_the_smallest_town(tmp_path):
+    run = tmp_path / "runs" / "tiny-tr"
+    result = _command("muvo_jax.train", "--preset=tiny", f"--runs-dir={tmp_path}/runs",
+                      XDG_CACHE_HOME=str(tmp_path / "cache"))
+    assert result.returncode == 0, result.stderr
+    assert json.loads((run / "evaluation.json").read_text())["splits"].keys() == {"val_rl", "val_ds", "train"}
+    assert list(run.glob("dreams/*.gif")) and list(run.glob("previews/*.png")) and (run / "curves.png").is_file()
+    again = _command("muvo_jax.dream", str(run), "--branches=2", f"--out={tmp_path}/out",
+                     XDG_CACHE_HOME=str(tmp_path / "cache"))
+    assert again.returncode == 0, again.stderr
+    assert list((tmp_path / "out").glob("*.gif"))

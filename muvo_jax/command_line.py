@@ -21,7 +21,7 @@ import tyro
 from muvo_jax import config as config_lib
 from muvo_jax.data import schema, sources
 from muvo_jax.data.town import record
-from muvo_jax.training import screen
+from muvo_jax.training import host, screen
 
 TRACEBACK_VARIABLE = "MUVO_JAX_TRACEBACK"
 EXPECTED_ERRORS = (ValueError, OSError, ArithmeticError)  # DataError, CheckpointError and NonFiniteLossError are these
@@ -47,7 +47,9 @@ def run(options_type: type[_Options], work: Callable[[_Options, screen.Screen], 
     Returns:
       The exit code: 0 done, 1 an error that was explained, 130 interrupted. A wrong command line raises SystemExit(2).
     """
-    arguments = sys.argv[1:] if arguments is None else arguments
+    if arguments is None:
+        host.restart_with_huge_pages()
+        arguments = sys.argv[1:]
     check_options(options_type, program, arguments)
     paragraphs = [inspect.getdoc(options_type) or "", "Examples:", *examples.strip().splitlines()]
     description = "\n\n".join(paragraphs)  # the help joins lines, but not paragraphs

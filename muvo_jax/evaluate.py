@@ -35,7 +35,8 @@ SOURCES = {"model": "model", "copy_last": "copy-last", "training_mean": "trainin
 class Options:
     """Judges a run on every split: frames that it observed and frames that it imagined, beside two baselines.
 
-    Prints tables and writes RUN/evaluation.json and RUN/report.md.
+    Prints tables and writes RUN/evaluation.json and RUN/report.md (with the name of the recording where it is another
+    one than the run's).
     """
 
     run: Annotated[pathlib.Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
@@ -96,8 +97,9 @@ def evaluate(options: Options, show: screen.Screen) -> dict[str, Any]:
         report["splits"][split] = scores
         for phase in protocol.PHASES:
             show.console.print(screen_table(split, phase, scores))
-    write_report(loaded.folder, report)
-    show.line(f"wrote {loaded.folder / 'evaluation.json'} and {loaded.folder / 'report.md'}")
+    suffix = f"-{recording.description.name}" if options.data else ""
+    for path in write_report(loaded.folder, report, suffix):
+        show.line(f"wrote {path}")
     return report
 
 
@@ -164,10 +166,12 @@ def number(value: float, decimals: int) -> str:
     return "nan" if math.isnan(value) else f"{value:.{decimals}f}"
 
 
-def write_report(folder: pathlib.Path, report: Mapping[str, Any]) -> None:
-    """RUN/evaluation.json (not-a-number as the string "nan") and RUN/report.md."""
-    (folder / "evaluation.json").write_text(json.dumps(json_ready(report), indent=1) + "\n", encoding="utf-8")
-    (folder / "report.md").write_text(markdown(report), encoding="utf-8")
+def write_report(folder: pathlib.Path, report: Mapping[str, Any], suffix: str = "") -> tuple[pathlib.Path, ...]:
+    """Writes RUN/evaluation.json (not-a-number as the string "nan") and RUN/report.md; returns their paths."""
+    numbers, page = folder / f"evaluation{suffix}.json", folder / f"report{suffix}.md"
+    numbers.write_text(json.dumps(json_ready(report), indent=1) + "\n", encoding="utf-8")
+    page.write_text(markdown(report), encoding="utf-8")
+    return numbers, page
 
 
 def json_ready(value):

@@ -8,7 +8,7 @@ is undefined as a whole is NaN, never 0. BatchNorm runs on its running statistic
 from __future__ import annotations
 
 import functools
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from typing import Any
 
 import jax
@@ -134,10 +134,11 @@ def evaluate(model: world_model.WorldModel, variables: types.Variables, batches:
                for phase, (start, stop) in spans.items() for source in sources[phase]}
     windows = unknown = 0
     key = jax.random.key(evaluation.seed)
-    for index, (batch, count) in enumerate(batches):
-        frames = predict(model, variables, jax.random.fold_in(key, index), batch, context=data.context,
-                         horizon=data.horizon, sampled=evaluation.sampled)
-        truth = batch[:count]
+    dispatched = ((index, batch, count, _predict(model, variables, jax.random.fold_in(key, index), batch, data.context,
+                                                 data.horizon, evaluation.sampled))
+                  for index, (batch, count) in enumerate(batches))
+    for index, batch, count, future in _one_ahead(dispatched):  # the device predicts while the host scores
+        frames, truth = jax.device_get(future), batch[:count]
         copied, copied_unknown = baselines.copy_last(truth, data.context, data.horizon)
         unknown += copied_unknown
         windows += count
@@ -155,6 +156,16 @@ def evaluate(model: world_model.WorldModel, variables: types.Variables, batches:
     for phase in PHASES:
         result[phase] = {source: tallies[phase, source].scores() for source in sources[phase]}
     return result
+
+
+def _one_ahead(items: Iterable[Any]) -> Iterator[Any]:
+    """The same items, each handed out after the next one was asked for."""
+    iterator = iter(items)
+    for held in iterator:
+        for following in iterator:
+            yield held
+            held = following
+        yield held
 
 
 def _repeat(mean: baselines.Frames, count: int, steps: int) -> baselines.Frames:

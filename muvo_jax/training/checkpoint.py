@@ -83,7 +83,7 @@ class Checkpoints:
 
     def __init__(self, run_folder: str | os.PathLike, *, keep_last: int = 2, keep_best: int = 1):
         """Keeps the `keep_last` newest (at least two: a damaged one needs a predecessor) and the best by score."""
-        logging.getLogger("absl").setLevel(logging.ERROR)
+        _quiet()
         self.run_folder = pathlib.Path(run_folder).resolve()
         self.folder = self.run_folder / FOLDER
         self._policy = _preservation.AnyPreservationPolicy([
@@ -283,7 +283,13 @@ def _candidates(checkpoints: pathlib.Path, found: list[int], which: int | str) -
     return [int(which)]
 
 
+def _quiet() -> None:
+    """Orbax reports every step of its work, and warns of metadata that a single item does not have."""
+    logging.getLogger("absl").setLevel(logging.ERROR)
+
+
 def _restore_variables(folder: pathlib.Path) -> types.Variables:
+    _quiet()
     with ocp.StandardCheckpointer() as reader:
         target = jax.tree.map(_on_first_device, reader.metadata(folder).item_metadata.tree)
         return reader.restore(folder, target)

@@ -156,8 +156,8 @@ class ModelConfig:
 class LossConfig:
     """Weights of the loss terms (paper Eq. 1) at scale 1; scale f counts 1/f.
 
-    `image`, `range_xyz`, `range_depth` and `occupancy_*` apply per scale; 0 switches a term off. The Chamfer term looks at
-    `chamfer_points` returns of each side; a predicted return is a predicted range above `return_threshold_m`.
+    `image`, `range_xyz`, `range_depth` and `occupancy_*` apply per scale; 0 switches a term off. The Chamfer term looks
+    at `chamfer_points` returns of each side; a predicted return is a predicted range above `return_threshold_m`.
     """
 
     image: float = 0.1
@@ -182,7 +182,7 @@ class OptimizerConfig:
     Attributes:
       weight_decay: applied to parameters with more than one axis.
       warmup_fraction: share of the steps until the peak.
-      start_divisor, end_divisor: the rate starts at peak / start_divisor and ends at peak / start_divisor / end_divisor.
+      start_divisor, end_divisor: from peak / start_divisor up, and down to peak / start_divisor / end_divisor.
       clip_norm: global gradient norm, 0 for no clipping (the reference clips nothing).
       accumulate: micro-batches per update.
     """
@@ -296,7 +296,7 @@ class Config:
         Raises:
           ValueError: for an unknown field (naming the nearest known one) or a value of the wrong type.
         """
-        return _from_dict(cls, values, "config")
+        return parse(cls, values, "config")
 
 
 def parse(cls, values: dict[str, Any], path: str):
@@ -305,7 +305,12 @@ def parse(cls, values: dict[str, Any], path: str):
     Raises:
       ValueError: for an unknown field (naming the nearest known one) or a value of the wrong type.
     """
-    return _from_dict(cls, values, path)
+    if not isinstance(values, dict):
+        raise ValueError(f"{path}: got {values!r}, expected the fields of {cls.__name__}.")
+    hints = typing.get_type_hints(cls)
+    for name in values:
+        _check_choice(f"{path} ({cls.__name__})", name, tuple(hints))
+    return cls(**{name: _coerce(hints[name], value, f"{path}.{name}") for name, value in values.items()})
 
 
 def override(config, dotted: str, value: Any):
@@ -322,22 +327,13 @@ def override(config, dotted: str, value: Any):
         node = node[name]
     _check_choice(f"field of {dotted!r}", leaf, tuple(node))
     node[leaf] = value
-    return _from_dict(type(config), values, "config")
-
-
-def _from_dict(cls, values, path: str):
-    if not isinstance(values, dict):
-        raise ValueError(f"{path}: got {values!r}, expected the fields of {cls.__name__}.")
-    hints = typing.get_type_hints(cls)
-    for name in values:
-        _check_choice(f"{path} ({cls.__name__})", name, tuple(hints))
-    return cls(**{name: _coerce(hints[name], value, f"{path}.{name}") for name, value in values.items()})
+    return parse(type(config), values, "config")
 
 
 def _coerce(hint, value, path: str):
     """Returns `value` as `hint` wants it (JSON lists become tuples, whole floats stay floats), or raises."""
     if dataclasses.is_dataclass(hint):
-        return _from_dict(hint, value, path)
+        return parse(hint, value, path)
     origin, arguments = typing.get_origin(hint), typing.get_args(hint)
     if origin is Literal:
         _check_choice(path, value, arguments)

@@ -69,7 +69,7 @@ def tiny() -> config_lib.Config:
 
 
 def paper() -> config_lib.Config:
-    """The paper's camera and lidar model (section IV): 12 frames, 6 observed and 6 imagined, batch 16 by accumulation."""
+    """The paper's camera and lidar model (section IV): 12 frames, 6 of them observed, batch 16 by accumulation."""
     return config_lib.Config(
         preset="paper",
         model=config_lib.ModelConfig(heads=("image", "range_view", "action")),

@@ -9,6 +9,7 @@ Time: `action[t]` is applied from t to t+1.
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Mapping
 from typing import Any
 
@@ -81,7 +82,7 @@ class Batch(_Indexable):
         untimed = ("intrinsics", "camera_to_ego")
         timed = {name: value[:, start:stop] for name, value in vars(self).items()
                  if value is not None and name not in untimed}
-        return self.replace(**timed)
+        return dataclasses.replace(self, **timed)
 
     def validate(self) -> Batch:
         """Checks dtypes, ranks and common prefixes (static under jit).

@@ -68,9 +68,9 @@ def town_frame() -> dict[str, np.ndarray]:
 def masked_xyz(frame: dict[str, np.ndarray]) -> tuple[str, str]:
     """L2 of xyz (units of 50 m) where every point is predicted at the origin."""
     target = jnp.asarray(frame["range_view"], jnp.float32)[None, None]
-    values = [float(regression.range_view_sums(jnp.zeros_like(target), target, scale_m=50.0, mask_holes=masked)[0].value())
-              for masked in (True, False)]
-    return f"{values[0]:.4f}", f"{values[1]:.4f}"
+    origin = jnp.zeros_like(target)
+    xyz = [regression.range_view_sums(origin, target, scale_m=50.0, mask_holes=masked)[0] for masked in (True, False)]
+    return f"{float(xyz[0].value()):.4f}", f"{float(xyz[1].value()):.4f}"
 
 
 def unknown_voxels(frame: dict[str, np.ndarray]) -> tuple[str, str]:
@@ -84,7 +84,7 @@ def unknown_voxels(frame: dict[str, np.ndarray]) -> tuple[str, str]:
 
 
 def chamfer_of_pixels(frame: dict[str, np.ndarray]) -> tuple[str, str]:
-    """Chamfer distance (m) of the frame to itself moved by 1 m: returns alone, or 10,000 random pixels, holes included."""
+    """Chamfer distance (m) of the frame to itself moved by 1 m: of returns, or of 10,000 random pixels, holes too."""
     truth = np.asarray(frame["range_view"], np.float32)
     moved = truth.copy()
     moved[truth[..., 3] > 0, 0] += 1.0

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from flax import linen
 
 from muvo_jax.config import ModelConfig
@@ -20,6 +21,15 @@ from muvo_jax.nn import layers
 from muvo_jax.types import Gaussian, LatentState, StepNoise
 
 LEAKY_SLOPE = {"standard": 0.01, "reference": 1.0}
+# A fresh model's raw standard deviation: 2 sigmoid(-4 / 2) + 0.1 = 0.34. At 0, which gives 1.1, the noise of the first
+# steps hides what the latent says, and it is long ignored. Trained weights bring their own.
+_INITIAL_RAW_STD = -4.0
+
+
+def initial_constants(config: ModelConfig) -> dict[str, np.ndarray]:
+    """Path of a parameter -> its first value: zero means and the first standard deviation of both Gaussian heads."""
+    bias = np.repeat(np.array([0.0, _INITIAL_RAW_STD], np.float32), config.stochastic_channels)
+    return {f"transition/{head}/out/bias": bias for head in ("prior", "posterior")}
 
 
 class GRUCell(linen.Module):
@@ -49,7 +59,7 @@ class GRUCell(linen.Module):
 class GaussianHead(linen.Module):
     """[..., C] and an action [..., 2] -> Gaussian [..., channels]: action embedding, two dense layers.
 
-    std = 2 sigmoid(raw / 2) + 0.1 lies in (0.1, 2.1) and is 1.1 where the network says nothing.
+    std = 2 sigmoid(raw / 2) + 0.1 lies in (0.1, 2.1).
     """
 
     channels: int

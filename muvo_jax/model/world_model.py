@@ -102,7 +102,8 @@ class WorldModel:
         """
         if batch is not None:
             self._frames(batch)
-        return init_lib.fill(self.variable_shapes(), key, heads.initial_constants(self.config))
+        constants = {**heads.initial_constants(self.config), **transition.initial_constants(self.config)}
+        return init_lib.fill(self.variable_shapes(), key, constants)
 
     def encode(self, variables: Variables, batch: Batch, *, train: bool = False, keys: jax.Array | None = None,
                axis_name: str | None = None) -> tuple[jax.Array, Variables]:

@@ -3,18 +3,19 @@
 | leaf | values |
 |---|---|
 | kernel of a backbone's convolution | normal, variance 2 / fan_out (He) |
-| in_proj kernel of an attention | uniform (Xavier); its bias and that of out_proj 0 |
-| other kernel, and its bias | uniform within 1 / sqrt(fan_in), torch's default |
+| in_proj kernel of an attention | uniform (Xavier) |
+| other kernel; its bias | uniform, variance 1 / fan_in (LeCun); 0 |
 | seed_kernel, transposed_kernel | uniform, variance 1.5 / (inputs that reach one output); their bias 0 |
-| kernel of an adaptive norm's style map | torch's default; its bias 1 for the scale, 0 for the shift |
+| bias of an adaptive norm's style map | 1 for the scale, 0 for the shift |
 | GRU kernels and biases | uniform within 1 / sqrt(hidden channels) |
 | scale of a norm; its bias | 1; 0 |
 | constant; type_embedding | standard normal; 0 |
 | running mean; running variance | 0; 1 |
 
-Torch's default would shrink the signal of a transposed stack several times a layer, and start adaptive norms at a scale
-near 0; both make the decoders slow to start, so these two depart from the reference (which matters to fresh models
-only). 1.5 makes up for ELU's loss of variance.
+Torch's defaults (uniform within 1 / sqrt(fan_in)) shrink the signal in every dense layer and several times in every
+transposed one, and start adaptive norms at a scale near 0: what a latent says then drowns in its noise, and decoders
+are slow to listen to it. So these rules depart from the reference, which matters to fresh models only. 1.5 makes up for
+ELU's loss of variance.
 """
 
 from __future__ import annotations
@@ -30,13 +31,13 @@ import numpy as np
 _ELU_VARIANCE_GAIN = 1.5
 
 
-def fill(shapes: Mapping[str, Any], key: jax.Array, constants: Mapping[str, float] | None = None) -> dict[str, Any]:
+def fill(shapes: Mapping[str, Any], key: jax.Array, constants: Mapping[str, Any] | None = None) -> dict[str, Any]:
     """Returns float32 arrays for a tree of shapes.
 
     Args:
       shapes: {"params": ..., "batch_stats": ...} with leaves that have a `shape`, as jax.eval_shape gives.
       key: typed PRNG key; each leaf depends on the key and its own path only.
-      constants: path of a parameter ("decoders/image/head_1/bias") -> value that replaces the rule.
+      constants: path of a parameter ("decoders/image/head_1/bias") -> number or array that replaces the rule.
     """
     words = [int(word) for word in np.asarray(jax.random.key_data(key)).ravel()]
     constants = constants or {}
@@ -46,7 +47,7 @@ def fill(shapes: Mapping[str, Any], key: jax.Array, constants: Mapping[str, floa
             return {name: visit(child, (*path, name)) for name, child in node.items()}
         name = "/".join(path[1:])
         if path[0] == "params" and name in constants:
-            return np.full(node.shape, constants[name], np.float32)
+            return np.broadcast_to(np.float32(constants[name]), node.shape).copy()
         random = np.random.default_rng([*words, zlib.crc32("/".join(path).encode())])
         siblings = shapes
         for part in path[:-1]:
@@ -68,25 +69,20 @@ def _leaf(path: tuple[str, ...], siblings: Mapping[str, tuple[int, ...]], random
         return random.standard_normal(shape, np.float32)
     if leaf == "scale":
         return np.ones(shape, np.float32)
-    if leaf == "type_embedding" or (leaf == "bias" and _has_zero_bias(path, siblings)):
-        return np.zeros(shape, np.float32)
     if leaf == "bias" and path[-2] == "style":
         return np.repeat(np.array([1, 0], np.float32), shape[0] // 2)
+    if leaf in ("type_embedding", "bias"):
+        return np.zeros(shape, np.float32)
     if "hidden_kernel" in siblings:
         return _uniform(random, shape, siblings["hidden_kernel"][0] ** -0.5)
     if leaf in ("seed_kernel", "transposed_kernel"):
         return _uniform(random, shape, math.sqrt(3 * _ELU_VARIANCE_GAIN / _reaching_inputs(leaf, shape)))
-    kernel = siblings["kernel"]
-    if leaf == "kernel" and path[-2] == "in_proj":
+    if path[-2] == "in_proj":
         return _uniform(random, shape, math.sqrt(6 / (shape[0] + shape[1])))
-    if leaf == "kernel" and "backbone" in path and len(shape) == 4:
+    if "backbone" in path and len(shape) == 4:
         fan_out = math.prod(shape[:-2]) * shape[-1]
         return np.float32(math.sqrt(2 / fan_out)) * random.standard_normal(shape, np.float32)
-    return _uniform(random, shape, math.prod(kernel[:-1]) ** -0.5)
-
-
-def _has_zero_bias(path: tuple[str, ...], siblings: Mapping[str, tuple[int, ...]]) -> bool:
-    return path[-2] in ("in_proj", "out_proj") or bool({"scale", "seed_kernel", "transposed_kernel"} & siblings.keys())
+    return _uniform(random, shape, math.sqrt(3 / math.prod(shape[:-1])))
 
 
 def _reaching_inputs(leaf: str, shape: tuple[int, ...]) -> float:

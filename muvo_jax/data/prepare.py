@@ -138,11 +138,11 @@ def _image_size(camera: schema.Camera, columns: int) -> tuple[int, int]:
 
 def _occupancy_blocks(wanted: int, grid: config_lib.VoxelGrid) -> int:
     """The most full-width decoder stages, up to `wanted`, that halve down to whole voxels."""
-    for blocks in range(wanted, 0, -1):
+    for blocks in range(wanted, -1, -1):
         if all(side % 2 ** (blocks + 3) == 0 for side in grid.shape):
             return blocks
     raise schema.DataError(f"the recorded voxel grid of {_by(grid.shape)} does not suit the voxel decoder: each "
-                           f"side must be a multiple of 16. Record another grid, or leave the occupancy head out.")
+                           f"side must be a multiple of 8. Record another grid, or leave the occupancy head out.")
 
 
 def _by(shape: tuple[int, ...]) -> str:

@@ -80,8 +80,8 @@ def test_recorded_voxels_route_and_contract_are_used(plain_recording):
 def test_a_small_recorded_grid_gets_a_shallower_voxel_decoder(plain_recording):
     config, notes = prepare.adapt(presets.get("paper-occupancy"), plain_recording)
     assert config.model.occupancy_blocks == 1 and any("voxel decoder" in note for note in notes)
-    odd = config_lib.VoxelGrid(shape=(24, 16, 16))
-    with pytest.raises(schema.DataError, match=r"24x16x16 .*multiple of 16"):
+    odd = config_lib.VoxelGrid(shape=(20, 16, 16))
+    with pytest.raises(schema.DataError, match=r"20x16x16 .*multiple of 8"):
         prepare.adapt(presets.get("tiny"), with_description(plain_recording, voxels=odd))
 
 

@@ -13,8 +13,8 @@ def town() -> config_lib.Config:
 
     A few hundred updates are too few for the paper's recipe, whose weights let the action and the KL divergence speak
     louder than image and range: these two are raised here. So is the cross-entropy of occupancy, since the affinity
-    losses alone call a voxel occupied that is so in a third of the frames. Training windows are half as long as evaluation's, so that a
-    batch shows twice as many places and weathers; BatchNorm and the decoders learn faster from that.
+    losses alone call a voxel occupied that is so in a third of the frames. Training windows are half as long as
+    evaluation's, so that a batch shows twice as many places and weathers; BatchNorm and the decoders learn faster.
     """
     model = config_lib.ModelConfig(
         image_size=(64, 256),
@@ -39,8 +39,8 @@ def town() -> config_lib.Config:
         loss=config_lib.LossConfig(image=1.0, range_xyz=2.0, range_depth=2.0, occupancy_cross_entropy=1.0, action=0.2),
         optimizer=config_lib.OptimizerConfig(learning_rate=2e-3, warmup_fraction=0.1, clip_norm=10.0),
         data=config_lib.DataConfig(frames=6),
-        train=config_lib.TrainConfig(steps=420, batch=4, log_every=20, validate_every=210, checkpoint_every=210,
-                                     preview_every=420, validation_windows=8),
+        train=config_lib.TrainConfig(steps=380, batch=4, validate_every=190, checkpoint_every=190, preview_every=380,
+                                     validation_windows=8),
         evaluation=config_lib.EvaluationConfig(windows=32),
     )
 

@@ -92,7 +92,9 @@ class TrainBatches:
         self.windows_per_epoch = len(windows)
         self._identity = {"seed": seed, "windows": len(windows), "batch": size, "frames": data.frames,
                           "stride": data.stride}
-        dataset = grain.MapDataset.source(windows).seed(seed).shuffle().repeat().batch(size, batch_fn=frames.batch)
+        # There is no remainder to drop; without the flag Grain's length of batches of one overflows.
+        dataset = grain.MapDataset.source(windows).seed(seed).shuffle().repeat().batch(
+            size, drop_remainder=True, batch_fn=frames.batch)
         options = grain.ReadOptions(num_threads=_READ_THREADS, prefetch_buffer_size=_READ_AHEAD)
         self._iterator = iter(dataset.to_iter_dataset(options))
         if start_state is not None:

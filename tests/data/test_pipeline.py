@@ -100,6 +100,11 @@ def test_an_epoch_is_every_window_once_and_epochs_differ():
     assert first != second
 
 
+def test_batches_of_one_window_come_for_ever():
+    stream = pipeline.train_batches(frames_of(), seed=0, batch=1)
+    assert all(batch.batch_size == 1 for batch in take(stream, 2 * stream.windows_per_epoch + 1))
+
+
 def test_the_seed_decides_the_order():
     orders = [speeds(take(pipeline.train_batches(frames_of(), seed=seed), 6)) for seed in (0, 0, 1)]
     assert orders[0] == orders[1] != orders[2]

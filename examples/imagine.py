@@ -16,7 +16,8 @@ def main(run: str) -> None:
     model, variables = muvo_jax.load(run)
     frames = pipeline.Frames(command_line.open_data(config, screen.Screen()), config)
     split = frames.recording.description.splits[-1]
-    batch = next(iter(pipeline.evaluation_batches(frames, split, windows=2, length=config.data.context))).batch
+    batches = pipeline.evaluation_batches(frames, split, windows=2, batch=2, length=config.data.context)
+    batch = next(iter(batches)).batch
 
     key_observe, key_imagine = jax.random.split(jax.random.key(0))
     observed = muvo_jax.observe(model, variables, key_observe, batch)

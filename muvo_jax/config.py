@@ -89,6 +89,8 @@ class ModelConfig:
       decoder_channels: width of the image and range-view decoders (512: 512, 512, 512, 512, 256, 128, 64).
       occupancy_channels, occupancy_blocks: width of the voxel decoder and number of its full-width stages; its
         constant input has shape / 2**(blocks + 3) voxels.
+      first_guess: "training_mean": decoders draw the difference from the average training frame; see model/outputs.py.
+      range_view_points: "beams": x, y, z are drawn as the difference from the point along the pixel's beam.
       compute_dtype: of the matrix work; parameters, norms, softmax and losses stay float32.
       convolution: "auto" takes the forms of ops/conv.py that are fast on this backend, "xla" the plain ones (needed for
         forward-mode differentiation), "gemm" the CPU forms.
@@ -122,6 +124,8 @@ class ModelConfig:
     decoder_channels: int = 512
     occupancy_channels: int = 64
     occupancy_blocks: int = 3
+    first_guess: Literal["zero", "training_mean"] = "zero"
+    range_view_points: Literal["free", "beams"] = "free"
     compute_dtype: Literal["float32", "bfloat16"] = "float32"
     convolution: Literal["auto", "xla", "gemm"] = "auto"
     range_scale_m: float = 50.0
@@ -236,6 +240,7 @@ class TrainConfig:
       validate_every, checkpoint_every, preview_every: in steps; 0 means at the end only.
       validation_windows: windows of each split looked at during training (evaluate uses all of them).
       keep_last, keep_best: how many checkpoints stay.
+      decode_frames: how many frames of a window are decoded in a training step, drawn anew each time; 0 means all.
       parallel: "auto" uses shard_map over all devices where there is more than one.
     """
 
@@ -251,6 +256,7 @@ class TrainConfig:
     keep_best: int = 1
     parallel: Literal["auto", "pmap", "shard_map"] = "auto"
     remat: bool = False
+    decode_frames: int = 0
 
 
 @dataclasses.dataclass(frozen=True)

@@ -19,7 +19,7 @@ import jax.numpy as jnp
 from flax import linen
 
 from muvo_jax.config import ModelConfig
-from muvo_jax.model import camera, common, fusion, heads, lidar, measurements, transition
+from muvo_jax.model import camera, common, fusion, heads, lidar, measurements, outputs, transition
 from muvo_jax.nn import init as init_lib
 from muvo_jax.nn import norm
 from muvo_jax.types import Batch, Gaussian, LatentState, Predictions, StepNoise, Variables
@@ -44,6 +44,9 @@ class Network(linen.Module):
         self.transition = transition.REGISTRY[config.latent](config)
         self.decoders = {name: head.build(config, head.channels) for name, head in heads.TABLE.items()
                          if name in config.heads}
+        if config.first_guess == "training_mean":
+            self.first_guess = {name: outputs.FirstGuess() for name in outputs.FIRST_GUESS_HEADS
+                                if name in config.heads}
 
     def encode(self, frames: dict[str, jax.Array], mode: norm.Mode, keys: jax.Array | None) -> jax.Array:
         measured = []
@@ -61,7 +64,10 @@ class Network(linen.Module):
         return self.transition.imagine_step(*args)
 
     def decode(self, features: jax.Array, names: tuple[str, ...]) -> Predictions:
-        return {name: self.decoders[name](features) for name in names}
+        raw = {name: self.decoders[name](features) for name in names}
+        if self.config.first_guess == "training_mean":
+            raw |= {name: guess(raw[name]) for name, guess in self.first_guess.items() if name in names}
+        return raw
 
     def everything(self, frames: dict[str, jax.Array], noise: StepNoise, action: jax.Array, state: LatentState,
                    is_first: jax.Array) -> Predictions:
@@ -189,7 +195,7 @@ class WorldModel:
                              f"it has {', '.join(self.config.heads)}.")
         lead = features.shape[:-1]
         flat = self._apply(variables, "decode", features.reshape(-1, features.shape[-1]), names)
-        return {name: {scale: _in_units(value, name, self.config).reshape(*lead, *value.shape[1:])
+        return {name: {scale: _finished(value, name, scale, self.config).reshape(*lead, *value.shape[1:])
                        for scale, value in scales.items()} for name, scales in flat.items()}
 
     def _apply(self, variables: Variables, method: str, *args, **options) -> Any:
@@ -218,7 +224,9 @@ class WorldModel:
         return frames
 
 
-def _in_units(value: jax.Array, name: str, config: ModelConfig) -> jax.Array:
+def _finished(value: jax.Array, name: str, scale: int, config: ModelConfig) -> jax.Array:
+    if name == "range_view" and config.range_view_points == "beams":
+        value = outputs.along_beams(value, scale, config)
     unit = heads.TABLE[name].unit(config)
     return value if unit == 1.0 else value * unit
 

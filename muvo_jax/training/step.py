@@ -26,6 +26,7 @@ from muvo_jax.training import parallel as parallel_lib
 from muvo_jax.training import state as state_lib
 
 Metrics = dict[str, types.Array]
+_DECODE_SITE = 0xDEC0  # separates this draw from all others made with the same sample key
 _VALIDATION_STEP = 2**31 - 1  # folded into the key where training folds its step in; no run gets there
 
 
@@ -180,16 +181,31 @@ def forward(params: Any, batch_stats: Any, batch: types.Batch, keys: types.Array
     variables = {"params": params, "batch_stats": batch_stats}
     observe = functools.partial(rollout.observe_window, model, train=train, axis_name=axis_name)
     observed, batch_stats = maybe_remat(observe)(variables, batch, keys)
+    features, batch = _decoded_frames(observed.states.features, batch, keys, config.train.decode_frames if train else 0)
     predictions: types.Predictions = {}
     for head in model.config.heads:
         decode = functools.partial(model.decode, heads=(head,))
-        predictions |= maybe_remat(decode)(variables, observed.states.features)
+        predictions |= maybe_remat(decode)(variables, features)
     terms = total.losses(predictions, batch, observed, model=model.config, loss=config.loss, keys=keys,
                          axis_name=axis_name)
     metrics = dict(terms)
     if batch.image is not None and "image" in predictions:
         metrics["psnr_db"] = _mean(image_metrics.frame_psnr_db(predictions["image"][1], batch.image), axis_name)
     return terms["total"], (metrics, batch_stats)
+
+
+def _decoded_frames(features: types.Array, batch: types.Batch, keys: types.Array,
+                    count: int) -> tuple[types.Array, types.Batch]:
+    """Of each window the `count` frames that are decoded, drawn anew in every step; 0 or T takes all of them.
+
+    Neighbouring frames look alike: decoding a few of more windows teaches more at the same cost.
+    """
+    if count in (0, batch.frames):
+        return features, batch
+    draw = lambda key: jax.random.permutation(jax.random.fold_in(key, _DECODE_SITE), batch.frames)[:count]
+    chosen = jax.vmap(draw)(keys)
+    pick = jax.vmap(lambda leaf, index: leaf[index])
+    return pick(features, chosen), batch.map_frames(lambda leaf: pick(leaf, chosen))
 
 
 def _mean(values: types.Array, axis_name: str | None) -> types.Array:

@@ -6,6 +6,7 @@ printed, hashed or compared, and no work grows faster than the file.
 
 from __future__ import annotations
 
+import itertools
 import math
 import re
 from collections.abc import Callable, Sequence
@@ -66,6 +67,14 @@ class _Array(StandIn):
         else:
             raise Refused(f"holds {kind(data)} for an array of objects of another size.")
 
+    @property
+    def size(self) -> int:
+        """Bytes of the file that it must have taken, at least."""
+        return len(self.values) if isinstance(self.values, list) else self.values.size
+
+    def listed(self) -> list:
+        return list(self.values)
+
     def row(self, index: int) -> np.ndarray | list:
         """Row `index` of an array with two axes."""
         if isinstance(self.values, np.ndarray):
@@ -75,13 +84,68 @@ class _Array(StandIn):
 
 
 class _Strings(StandIn):
-    """pandas.arrays.StringArray: its state holds an array of objects and a dtype."""
+    """pandas.arrays.StringArray (its state holds an array of objects) or ArrowStringArray (one of pyarrow's)."""
 
     def __init__(self, *_):
         self.array = _Array()
 
     def setstate(self, state: Any) -> None:
-        (self.array,) = (part for part in state if isinstance(part, _Array))
+        parts = state.values() if isinstance(state, dict) else state
+        (self.array,) = (part for part in parts if isinstance(part, _Array))
+
+
+class _Buffer(StandIn):
+    """pyarrow.lib.py_buffer."""
+
+    def __init__(self, content: Any):
+        self.content = content
+
+
+class _ArrowType(StandIn):
+    """pyarrow.lib.type_for_alias."""
+
+    def __init__(self, name: Any):
+        if name not in ("string", "large_string"):
+            raise Refused("holds a column of pyarrow that is not of strings.")
+        self.offset = np.dtype("<i4" if name == "string" else "<i8")
+
+
+class _Text(_Array):
+    """Strings of pyarrow, decoded only once the frame has been found not to be larger than its file.
+
+    An array is (type, length, nulls, first, [validity bits, ends of the strings, their bytes], ...); several make one
+    that is chunked.
+    """
+
+    def __init__(self, *arrays: Any):
+        super().__init__()
+        self.arrays = arrays
+        self.shape = (sum(array[1] for array in arrays),)
+
+    @classmethod
+    def chunked(cls, chunks: Any, *_) -> _Text:
+        return cls(*(chunk.arrays[0] for chunk in chunks))
+
+    @property
+    def size(self) -> int:
+        return sum(len(buffer.content) for array in self.arrays for buffer in array[4] if buffer is not None)
+
+    def listed(self) -> list:
+        return [value for array in self.arrays for value in _decoded(*array)]
+
+
+def _decoded(kind_: _ArrowType, length: int, _nulls: Any, first: int, buffers: Any, *_) -> list[str | None]:
+    validity, ends, text = buffers
+    bounds = np.frombuffer(ends.content, kind_.offset)[first:first + length + 1]
+    content = text.content if text is not None else b""
+    if len(bounds) != length + 1 or (np.diff(bounds) < 0).any() or bounds[0] < 0 or bounds[-1] > len(content):
+        raise Refused("holds strings of pyarrow whose bounds do not fit.")
+    pairs = itertools.pairwise(bounds.tolist())
+    values: list[str | None] = [bytes(content[start:end]).decode() for start, end in pairs]
+    if validity is None:
+        return values
+    bits = np.unpackbits(np.frombuffer(validity.content, np.uint8), bitorder="little")[first:first + length]
+    return [value if bit else None for value, bit in zip(values, bits, strict=True)]
 
 
 class _Ignored(StandIn):
@@ -98,7 +162,7 @@ class _Index(StandIn):
         data = values.get("data") if isinstance(values, dict) else None
         if isinstance(data, _Strings):
             data = data.array
-        self.labels = list(data.values) if isinstance(data, _Array) else []
+        self.labels = data if isinstance(data, _Array) else _Array()
 
 
 class _Block(StandIn):
@@ -108,9 +172,8 @@ class _Block(StandIn):
         self.values, self.placement = values, placement
 
     @property
-    def cells(self) -> int:
-        values = self.values.array if isinstance(self.values, _Strings) else self.values
-        return len(values.values) if isinstance(values.values, list) else values.values.size
+    def size(self) -> int:
+        return (self.values.array if isinstance(self.values, _Strings) else self.values).size
 
     def rows(self) -> list[tuple[int, np.ndarray | list]]:
         """(number of the column, its cells)."""
@@ -120,7 +183,7 @@ class _Block(StandIn):
         else:
             numbers = placement.values
         if isinstance(self.values, _Strings) and len(numbers) == 1:
-            return [(int(numbers[0]), self.values.array.values)]
+            return [(int(numbers[0]), self.values.array.listed())]
         if not isinstance(self.values, _Array) or len(self.values.shape) != 2 or self.values.shape[0] != len(numbers):
             raise Refused(f"holds a block of {kind(self.values)}, which is not supported.")
         return [(int(number), self.values.row(row)) for row, number in enumerate(numbers)]
@@ -147,9 +210,10 @@ class Frame(StandIn):
     def columns(self, limit: int, where: str) -> dict[str, Sequence]:
         """By name; `limit` is the size of the file: a cell takes at least a byte of it."""
         try:
-            names = self.manager.axes[0].labels
-            if sum(block.cells for block in self.manager.blocks) > limit:
+            labels = self.manager.axes[0].labels
+            if labels.size + sum(block.size for block in self.manager.blocks) > limit:
                 raise Refused(f"{where}: more cells than the file has bytes. {HOW_TO_GO_ON}")
+            names = labels.listed()
             by_number = dict(row for block in self.manager.blocks for row in block.rows())
             table = {str(name): plain(by_number[number], where) for number, name in enumerate(names)}
         except (AttributeError, TypeError, ValueError, KeyError, IndexError) as error:
@@ -195,9 +259,12 @@ def _names() -> dict[tuple[str, str], Callable]:
     for core in ("numpy.core", "numpy._core"):
         known |= {(f"{core}.multiarray", "_reconstruct"): _Array, (f"{core}.multiarray", "scalar"): _scalar,
                   (f"{core}.numeric", "_frombuffer"): _from_buffer}
+    known |= {("pyarrow.lib", "_restore_array"): _Text, ("pyarrow.lib", "chunked_array"): _Text.chunked,
+              ("pyarrow.lib", "type_for_alias"): _ArrowType, ("pyarrow.lib", "py_buffer"): _Buffer}
     for name, old, made in (("DataFrame", "pandas.core.frame", Frame), ("Index", "pandas.core.indexes.base", _Index),
                             ("RangeIndex", "pandas.core.indexes.range", _Index),
                             ("StringArray", "pandas.core.arrays.string_", _Strings),
+                            ("ArrowStringArray", "pandas.core.arrays.string_arrow", _Strings),
                             ("StringDtype", "pandas.core.arrays.string_", _Ignored)):
         known |= {(module, name): made for module in ("pandas", "pandas.arrays", old)}
     return known

@@ -58,7 +58,7 @@ def load_npy(path: pathlib.Path) -> Any:
         version = np.lib.format.read_magic(file)
         read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
         shape, is_fortran, dtype = read(file)
-    except (ValueError, EOFError, OverflowError, MemoryError, RecursionError) as error:
+    except Exception as error:  # NumPy reads the header with Python's parser, which has many ways to object
         raise schema.DataError(f"{path}: not a readable NPY file ({error}). Copy it again.") from error
     rest = content[file.tell():]
     if not dtype.hasobject:
@@ -114,7 +114,8 @@ class _Unpickler(_Python):
     def find_class(self, module: str, name: str) -> Callable:
         made = standins.NAMES.get((module, name))
         if made is None:
-            raise standins.Refused(f"asks for {module[:60]}.{name[:60]}, which is not data; refused without executing it.")
+            raise standins.Refused(f"asks for {module[:60]}.{name[:60]}, which is not data; refused without executing "
+                                   f"it.")
         return made
 
     def load_reduce(self) -> None:

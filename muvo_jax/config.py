@@ -11,7 +11,7 @@ from typing import Any, Literal
 FUSIONS = ("tr",)
 LIDAR_ENCODERS = ("rv",)
 CAMERA_ENCODERS = ("wob",)
-LATENTS = ("1d",)
+LATENTS = ("1d", "2d")
 HEADS = ("image", "range_view", "occupancy", "action")
 
 
@@ -84,11 +84,15 @@ class ModelConfig:
       token_channels, transformer_*: the fusion transformer.
       fused_channels: channels of each sensor's pooled vector after fusion.
       embedding_channels: size of the observation embedding.
-      deterministic_channels, stochastic_channels, action_channels: the recurrent state-space model.
+      deterministic_channels, stochastic_channels, action_channels: the recurrent state-space model of the 1D latent.
+      transition_layers: of the transformers that are prior and posterior of the 2D latent, whose tokens have
+        token_channels; heads, hidden channels and dropout are those of transformer_*.
       prior_dropout: probability that a training step goes on from the prior sample.
       decoder_channels: width of the image and range-view decoders (512: 512, 512, 512, 512, 256, 128, 64).
       occupancy_channels, occupancy_blocks: width of the voxel decoder and number of its full-width stages; its
         constant input has shape / 2**(blocks + 3) voxels.
+      occupancy_token_stages: doublings at full width of the 2D latent's voxel decoder; the voxel tokens are a grid of
+        shape / 2**(stages + 3).
       first_guess: "training_mean": decoders draw the difference from the average training frame; see model/outputs.py.
       range_view_points: "beams": x, y, z are drawn as the difference from the point along the pixel's beam.
       compute_dtype: of the matrix work; parameters, norms, softmax and losses stay float32.
@@ -120,10 +124,12 @@ class ModelConfig:
     deterministic_channels: int = 1024
     stochastic_channels: int = 512
     action_channels: int = 64
+    transition_layers: int = 6
     prior_dropout: float = 0.15
     decoder_channels: int = 512
     occupancy_channels: int = 64
     occupancy_blocks: int = 3
+    occupancy_token_stages: int = 1
     first_guess: Literal["zero", "training_mean"] = "zero"
     range_view_points: Literal["free", "beams"] = "free"
     compute_dtype: Literal["float32", "bfloat16"] = "float32"
@@ -150,10 +156,15 @@ class ModelConfig:
         if self.token_channels % self.transformer_heads or self.token_channels % 4:
             raise ValueError(f"model.token_channels {self.token_channels} must be a multiple of 4 and of "
                              f"model.transformer_heads {self.transformer_heads}.")
-        shrink = 2 ** (self.occupancy_blocks + 3)
-        if "occupancy" in self.heads and any(side % shrink for side in self.voxels.shape):
+        tokens = self.latent == "2d"
+        if tokens and self.token_channels % 12:
+            raise ValueError(f"model.token_channels {self.token_channels} must be a multiple of 12 with "
+                             f"model.latent=2d (sine and cosine of three axes).")
+        field = "occupancy_token_stages" if tokens else "occupancy_blocks"
+        shrink = 2 ** (getattr(self, field) + 3)
+        if (tokens or "occupancy" in self.heads) and any(side % shrink for side in self.voxels.shape):
             raise ValueError(f"model.voxels.shape {self.voxels.shape}: each side must be a multiple of {shrink} "
-                             f"(2**(occupancy_blocks + 3)).")
+                             f"(2**({field} + 3)).")
 
 
 @dataclasses.dataclass(frozen=True)

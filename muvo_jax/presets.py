@@ -31,8 +31,10 @@ def town() -> config_lib.Config:
         deterministic_channels=384,
         stochastic_channels=128,
         decoder_channels=64,
+        transition_layers=1,
         occupancy_channels=32,
         occupancy_blocks=0,
+        occupancy_token_stages=0,
     )
     return config_lib.Config(
         preset="town",
@@ -53,7 +55,7 @@ def tiny() -> config_lib.Config:
         range_view=config_lib.RangeViewGeometry(rows=32, columns=64),
         voxels=config_lib.VoxelGrid(shape=(16, 16, 16), voxel_size_m=2.0, origin_m=(-16.0, -16.0, -3.0)),
         backbone_width=4,
-        token_channels=8,
+        token_channels=12,
         transformer_layers=1,
         transformer_heads=2,
         transformer_hidden_channels=16,
@@ -63,8 +65,10 @@ def tiny() -> config_lib.Config:
         stochastic_channels=8,
         action_channels=8,
         decoder_channels=8,
+        transition_layers=1,
         occupancy_channels=8,
         occupancy_blocks=1,
+        occupancy_token_stages=0,
     )
     return config_lib.Config(
         preset="tiny",

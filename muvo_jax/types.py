@@ -1,7 +1,7 @@
 """The pytrees that every part of muvo_jax exchanges.
 
 Axes: B batch, T time, N branches or points, H W image rows and columns, C channels (always last), X Y Z voxels,
-S stochastic channels, D deterministic channels.
+S stochastic channels, D deterministic channels. With the 2D latent [..., S] and [..., D] are tokens [..., N, C].
 
 Ego frame: x forward, y left, z up, metres, origin on the ground under the ego vehicle.
 Time: `action[t]` is applied from t to t+1.
@@ -132,8 +132,8 @@ class LatentState(_Indexable):
     """What the world model knows: the carry of the recurrence, for training, imagination, planning and live use.
 
     Attributes:
-      deterministic: float32 [..., D], the recurrent state h.
-      stochastic: float32 [..., S], the sampled state s.
+      deterministic: float32 [..., D], the recurrent state h; tokens [..., N, C] with the 2D latent.
+      stochastic: float32 [..., S], the sampled state s; tokens [..., N, C] with the 2D latent.
     """
 
     deterministic: Array
@@ -141,7 +141,10 @@ class LatentState(_Indexable):
 
     @property
     def features(self) -> Array:
-        """float32 [..., D + S], what decoders, policies and rewards read: h first, as in the reference."""
+        """float32 [..., D + S] ([..., N, 2 C] with the 2D latent), what decoders read: h first, as in the reference.
+
+        Policies and rewards that want one vector for either latent take WorldModel.policy_features of it.
+        """
         return jnp.concatenate([self.deterministic, self.stochastic], axis=-1)
 
 
@@ -150,13 +153,15 @@ class StepNoise(_Indexable):
     """Everything random in one observed step, drawn outside so that the step itself is deterministic.
 
     Attributes:
-      prior, posterior: standard normal, float32 [..., S]; zeros give the mean mode.
+      prior, posterior: standard normal, of the shape of the stochastic state; zeros give the mean mode.
       use_prior: bool [...], true where the next step starts from the prior sample (the paper's RSSM dropout).
+      dropout: typed keys [...] of the dropout inside the 2D latent's transformers; None switches it off.
     """
 
     prior: Array
     posterior: Array
     use_prior: Array
+    dropout: Array | None = None
 
 
 @flax.struct.dataclass

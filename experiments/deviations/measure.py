@@ -52,7 +52,7 @@ def first_step_kl(frames: int) -> tuple[str, str]:
 def prior_dropout_coin() -> tuple[str, str]:
     """Share of steps after the first in which all 8 windows of a batch toss the same coin (probability 0.15 each)."""
     keys = rollout.sample_keys(jax.random.key(0), 8)
-    coins = np.asarray(rollout.draw_noise(keys, 2000, 1, 0.15).use_prior)
+    coins = np.asarray(rollout.draw_noise(keys, 2000, (1,), 0.15).use_prior)
     batch_axis = coins.shape.index(8)
     same = coins.all(batch_axis) | ~coins.any(batch_axis)
     return f"{same.mean():.3f}", "1.000"

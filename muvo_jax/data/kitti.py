@@ -103,7 +103,7 @@ class KittiRecording:
         frame_id = int(drive.frame_ids[position])
         image_path, points_path, oxts_path = (drive.folder / sensor / "data" / f"{frame_id:010d}{suffix}"
                                               for sensor, suffix in self._sensors.items())
-        image = files.read_png(image_path, "RGB")
+        image = files.read_image(image_path, "RGB")
         if image.shape[:2] != (drive.camera.height_px, drive.camera.width_px):
             raise schema.DataError(f"{image_path}: {image.shape[1]}x{image.shape[0]} pixels, but the calibration "
                                    f"(S_rect) is for {drive.camera.width_px}x{drive.camera.height_px}. Use rectified "

@@ -1,4 +1,4 @@
-"""The reference's parameter names and layouts, and ours: a released 1D checkpoint becomes variables of WorldModel.
+"""The reference's parameter names and layouts, and ours: a released checkpoint becomes variables of WorldModel.
 
 Ours are translated to theirs by the rules below, so that what a checkpoint lacks and what nothing asks for are both
 named. Layouts: torch keeps (O, I, *K) for convolutions, (I, O, *K) for transposed ones and (O, I) for dense layers;
@@ -16,6 +16,9 @@ import numpy as np
 
 from muvo_jax.config import ModelConfig
 from muvo_jax.model import world_model
+
+_QUERIES = {"image": "image", "range_view": "lidar", "occupancy": "voxel", "action": "policy"}
+_GATES = {"update": "z", "reset": "r", "new": "q"}
 
 # Applied in turn to "module/module/leaf"; what remains of "/" becomes ".".
 _RULES: tuple[tuple[str, str | Callable[[re.Match[str]], str]], ...] = (
@@ -45,6 +48,15 @@ _RULES: tuple[tuple[str, str | Callable[[re.Match[str]], str]], ...] = (
     (r"^transition/(prior|posterior)/action", r"rssm/\1_action_module/0"),
     (r"^transition/(prior|posterior)/hidden", r"rssm/\1/module/0"),
     (r"^transition/(prior|posterior)/out", r"rssm/\1/module/2"),
+    (r"^transition/(prior|posterior)_action", r"rssm/\1_action_module/0"),
+    (r"^transition/(prior|posterior)/transformer/layer(\d+)/cross_attn", r"rssm/\1/module/layers/\2/multihead_attn"),
+    (r"^transition/(prior|posterior)/transformer/layer(\d+)", r"rssm/\1/module/layers/\2"),
+    (r"^transition/(prior|posterior)/moments", r"rssm/\1/fc"),
+    (r"^transition/((?:prior|posterior)/)?type_embedding", r"rssm/\1type_embeddings"),
+    (r"^transition/(prior|posterior)/query_(\w+)", lambda match: f"rssm/{match[1]}/query_embed_{_QUERIES[match[2]]}"),
+    (r"^transition/gru/gate", "rssm/recurrent_model/w"),
+    (r"^transition/gru/(update|reset|new)", lambda match: f"rssm/recurrent_model/conv_{_GATES[match[1]]}"),
+    (r"^(rssm/recurrent_model/conv_\w)_shared", r"\1_glo"),
     (r"^decoders_action/mlp/linear(\d)", lambda match: f"policy/fc/{2 * int(match[1])}"),
     (r"^decoders_image/(head_\d)", r"rgb_decoder/\1/rgb_head/0"),
     (r"^decoders_range_view/(head_\d)", r"lidar_re/\1/lidar_re_head/0"),
@@ -62,6 +74,11 @@ _RULES: tuple[tuple[str, str | Callable[[re.Match[str]], str]], ...] = (
     (r"^(voxel_decoder/.*(?:first_conv|conv\d))/(?:conv|0)/", r"\1/conv_act/0/"),
     (r"^(voxel_decoder/.*(?:first_conv|conv\d))/(?:norm|1)/style", r"\1/adaptive_norm/latent_affine"),
     (r"^voxel_decoder/first_norm/style", "voxel_decoder/first_norm/latent_affine"),
+    (r"^(rgb_decoder|lidar_re|voxel_decoder)/first/", r"\1/pre_transpose_conv/0/"),
+    (r"^(rgb_decoder|lidar_re)/pre(\d)/conv", lambda match: f"{match[1]}/pre_transpose_conv/{int(match[2]) + 2}/0"),
+    (r"^voxel_decoder/pre(\d)/conv", lambda match: f"voxel_decoder/pre_transpose_conv/{2 * int(match[1]) + 2}"),
+    (r"^(rgb_decoder|lidar_re|voxel_decoder)/grow_(\d)/conv",
+     lambda match: f"{match[1]}/trans_conv{ {4: 1, 2: 2, 1: 3}[int(match[2])] }/0"),
     (r"in_proj/kernel$", "in_proj_weight"),
     (r"in_proj/bias$", "in_proj_bias"),
     (r"/(kernel|seed_kernel|transposed_kernel|scale)$", "/weight"),
@@ -69,8 +86,8 @@ _RULES: tuple[tuple[str, str | Callable[[re.Match[str]], str]], ...] = (
     (r"/var$", "/running_var"),
 )
 
-# In every checkpoint and used by nothing: BatchNorm's counters, and the layer that the transformer was copied from.
-_UNUSED = re.compile(r"^encoder_layer\.|\.num_batches_tracked$")
+# In every checkpoint and used by nothing: BatchNorm's counters, and the layers that transformers were copied from.
+_UNUSED = re.compile(r"^encoder_layer\.|^rssm\.(prior|posterior)\.transformer_decoder_layer\.|\.num_batches_tracked$")
 
 
 def reference_key(path: str) -> str:
@@ -84,6 +101,8 @@ def to_our_layout(leaf: str, shape: tuple[int, ...], value: np.ndarray) -> np.nd
     """A reference array in the layout of our variable called `leaf` with `shape`."""
     if leaf == "type_embedding":
         return value[0, 0].T
+    if leaf.startswith("query_"):  # (1, C, *grid), or (1, 1, C) for a single token
+        return value[0] if value.ndim == 3 else value[0].reshape(value.shape[1], -1).T
     if leaf == "constant":
         return np.moveaxis(value, 0, -1)
     if leaf in ("seed_kernel", "transposed_kernel"):
@@ -93,6 +112,32 @@ def to_our_layout(leaf: str, shape: tuple[int, ...], value: np.ndarray) -> np.nd
     if leaf.endswith("kernel"):
         return np.moveaxis(value, (0, 1), (-1, -2))
     return value
+
+
+def to_reference_layout(path: str, value: np.ndarray) -> np.ndarray:
+    """One of our variables in torch's layout, without the axes of size 1 that only the reference has.
+
+    Args:
+      path: of the variable, "camera/backbone/conv1/kernel"; its last part says what it is.
+      value: the variable; the tokens of a query stay in one axis.
+    """
+    leaf = path.rsplit("/")[-1]
+    if leaf == "type_embedding":
+        return value.T[None, None]
+    if leaf.startswith("query_"):
+        return value[None] if leaf == "query_action" else value.T[None]
+    if leaf == "constant":
+        return np.moveaxis(value, -1, 0)
+    if leaf in ("seed_kernel", "transposed_kernel"):
+        return np.moveaxis(value, (-2, -1), (0, 1))
+    if leaf.endswith("kernel"):
+        return np.moveaxis(value, (-1, -2), (0, 1))
+    return value
+
+
+def reference_shape(path: str, shape: tuple[int, ...]) -> tuple[int, ...]:
+    """The shape that `to_reference_layout` gives to a variable of this shape."""
+    return to_reference_layout(path, np.broadcast_to(np.float32(0), shape)).shape
 
 
 def convert_state_dict(state_dict: Mapping[str, np.ndarray], model_config: ModelConfig) -> dict[str, Any]:

@@ -11,6 +11,6 @@ def compute(config: ModelConfig) -> layers.Compute:
     return layers.Compute(config.compute_dtype, config.convolution)
 
 
-def feature_channels(config: ModelConfig) -> int:
-    """Size of what decoders read: deterministic and stochastic state side by side."""
-    return config.deterministic_channels + config.stochastic_channels
+def measurement_channels(config: ModelConfig) -> int:
+    """Channels of an encoded measurement: a token's where it becomes one."""
+    return config.token_channels if config.latent == "2d" else config.measurement_channels

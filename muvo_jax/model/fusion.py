@@ -25,10 +25,11 @@ class Compression(linen.Module):
 
 
 class TransformerFusion(linen.Module):
-    """TR: the cells of both maps are tokens of one transformer; each sensor's tokens are then pooled to a vector.
+    """TR: the cells of both maps are tokens of one transformer.
 
-    Image and lidar maps [N, h, w, token_channels], measurements each [N, measurement_channels]
-    -> [N, embedding_channels].
+    Image and lidar maps [N, h, w, token_channels]. For the 1D latent each sensor's tokens are then pooled to a vector
+    and joined with the measurements [N, measurement_channels]: [N, embedding_channels]. For the 2D latent each
+    measurement [N, token_channels] is one more token, and the tokens are the embedding: [N, M, token_channels].
     """
 
     config: ModelConfig
@@ -38,15 +39,20 @@ class TransformerFusion(linen.Module):
                  keys: jax.Array | None) -> jax.Array:
         config, compute = self.config, common.compute(self.config)
         channels = config.token_channels
-        type_embedding = self.param("type_embedding", layers.shape_only, (2, channels))
+        as_tokens = measurements if config.latent == "2d" else []
+        type_embedding = self.param("type_embedding", layers.shape_only, (2 + len(as_tokens), channels))
         tokens = []
         for index, cells in enumerate((image_map, lidar_map)):
             added = jnp.asarray(attention.sine_positions(cells.shape[1:3], channels)) + type_embedding[index][None]
             tokens.append(cells.reshape(cells.shape[0], -1, channels) + added[None].astype(cells.dtype))
+        for index, value in enumerate(as_tokens, start=2):
+            tokens.append(jnp.expand_dims(value + type_embedding[index][None].astype(value.dtype), 1))
         image_count = tokens[0].shape[1]
         mixed = attention.TransformerEncoder(
             config.transformer_layers, config.transformer_heads, config.transformer_hidden_channels, config.dropout,
             compute, name="transformer")(jnp.concatenate(tokens, axis=1), keys)
+        if config.latent == "2d":
+            return mixed.astype(jnp.float32)
         image_vector = Compression(config.fused_channels, compute, name="image_compression")(
             mixed[:, :image_count].reshape(image_map.shape), mode)
         lidar_vector = Compression(config.fused_channels, compute, name="lidar_compression")(

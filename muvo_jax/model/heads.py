@@ -1,4 +1,4 @@
-"""The one table of what is decoded: a head's name, its decoder, channels, scales, unit and first guess."""
+"""The one table of what is decoded: a head's name, its decoder, channels, scales, tokens, unit and first guess."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from collections.abc import Callable
 from flax import linen
 
 from muvo_jax.config import ModelConfig
-from muvo_jax.model import common, decoders, outputs
+from muvo_jax.model import common, decoders, outputs, token_decoders, tokens
 
 
 @dataclasses.dataclass(frozen=True)
@@ -19,6 +19,7 @@ class Head:
       build: makes the decoder module, given the model's configuration and the channels.
       channels: of each output.
       scales: what the decoder returns; 1 is full size.
+      tokens: which group of the 2D latent the decoder reads (muvo_jax.model.tokens); with the 1D latent it reads all.
       unit: factor from the network's output to the prediction (the range view comes out in metres).
       initial_bias: bias of the last layers of a fresh model, the network's first guess.
     """
@@ -26,22 +27,34 @@ class Head:
     build: Callable[[ModelConfig, int], linen.Module]
     channels: int
     scales: tuple[int, ...]
+    tokens: str
     unit: Callable[[ModelConfig], float] = lambda config: 1.0
     initial_bias: float | None = None
 
 
+def _plane(config: ModelConfig, channels: int, size: tuple[int, int], token_shrink: int) -> linen.Module:
+    width = config.decoder_channels
+    if config.latent == "2d":
+        stages = token_shrink.bit_length() - 4  # three more doublings end in an output each
+        return token_decoders.TokenDecoder(channels, width, width, stages, common.compute(config))
+    return decoders.PlaneDecoder(size, channels, width, common.compute(config))
+
+
 def _image(config: ModelConfig, channels: int) -> linen.Module:
-    return decoders.PlaneDecoder(config.image_size, channels, config.decoder_channels, common.compute(config))
+    return _plane(config, channels, config.image_size, tokens.IMAGE_SHRINK)
 
 
 def _range_view(config: ModelConfig, channels: int) -> linen.Module:
     size = (config.range_view.rows, config.range_view.columns)
-    return decoders.PlaneDecoder(size, channels, config.decoder_channels, common.compute(config))
+    return _plane(config, channels, size, tokens.RANGE_VIEW_SHRINK)
 
 
 def _occupancy(config: ModelConfig, channels: int) -> linen.Module:
-    return decoders.VoxelDecoder(config.voxels.shape, channels, config.occupancy_channels, config.occupancy_blocks,
-                                 common.compute(config))
+    width = config.occupancy_channels
+    if config.latent == "2d":
+        return token_decoders.TokenDecoder(channels, 2 * width, width, config.occupancy_token_stages,
+                                           common.compute(config))
+    return decoders.VoxelDecoder(config.voxels.shape, channels, width, config.occupancy_blocks, common.compute(config))
 
 
 def _action(config: ModelConfig, channels: int) -> linen.Module:
@@ -50,10 +63,11 @@ def _action(config: ModelConfig, channels: int) -> linen.Module:
 
 
 TABLE = {
-    "image": Head(_image, 3, (1, 2, 4), initial_bias=0.5),
-    "range_view": Head(_range_view, 4, (1, 2, 4), unit=lambda config: config.range_scale_m, initial_bias=0.0),
-    "occupancy": Head(_occupancy, 2, (1, 2, 4), initial_bias=0.0),
-    "action": Head(_action, 2, (1,)),
+    "image": Head(_image, 3, (1, 2, 4), "image", initial_bias=0.5),
+    "range_view": Head(_range_view, 4, (1, 2, 4), "range_view", unit=lambda config: config.range_scale_m,
+                       initial_bias=0.0),
+    "occupancy": Head(_occupancy, 2, (1, 2, 4), "occupancy", initial_bias=0.0),
+    "action": Head(_action, 2, (1,), "action"),
 }
 
 

@@ -12,7 +12,7 @@ from muvo_jax.nn import layers, norm, resnet
 
 
 class RouteEncoder(linen.Module):
-    """Route map uint8 [N, 64, 64] -> [N, measurement_channels]: a ResNet-18 on three equal channels, averaged."""
+    """Route map uint8 [N, 64, 64] -> [N, common.measurement_channels]: a ResNet-18 on three equal channels."""
 
     config: ModelConfig
 
@@ -21,16 +21,17 @@ class RouteEncoder(linen.Module):
         compute = common.compute(self.config)
         image = camera.normalise_image(jnp.repeat(jnp.expand_dims(route_map, -1), 3, axis=-1)).astype(compute.dtype)
         (deepest,) = resnet.ResNet18(self.config.backbone_width, (4,), compute, name="backbone")(image, mode)
-        return layers.Dense(self.config.measurement_channels, compute, name="linear")(jnp.mean(deepest, axis=(1, 2)))
+        channels = common.measurement_channels(self.config)
+        return layers.Dense(channels, compute, name="linear")(jnp.mean(deepest, axis=(1, 2)))
 
 
 class SpeedEncoder(linen.Module):
-    """Speed float32 [N] in m/s -> [N, measurement_channels]."""
+    """Speed float32 [N] in m/s -> [N, common.measurement_channels]."""
 
     config: ModelConfig
 
     @linen.compact
     def __call__(self, speed_mps: jax.Array) -> jax.Array:
         scaled = jnp.expand_dims(speed_mps / self.config.speed_scale_mps, -1)
-        channels = self.config.measurement_channels
-        return jax.nn.relu(layers.Mlp((channels, channels), common.compute(self.config), name="mlp")(scaled))
+        widths = (self.config.measurement_channels, common.measurement_channels(self.config))
+        return jax.nn.relu(layers.Mlp(widths, common.compute(self.config), name="mlp")(scaled))

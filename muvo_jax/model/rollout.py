@@ -16,6 +16,7 @@ from muvo_jax.model.world_model import WorldModel
 from muvo_jax.types import ArrayLike, Batch, Dream, LatentState, Observed, Predictions, StepNoise, Variables
 
 Policy = Callable[[jax.Array, jax.Array], jax.Array]
+_DROPOUT_SITE = 3  # the first three are those of jax.random.split(key, 3)
 
 
 def sample_keys(key: jax.Array, count: int) -> jax.Array:
@@ -30,33 +31,34 @@ def sample_keys(key: jax.Array, count: int) -> jax.Array:
     return key if key.shape else _fold_each(key, count)
 
 
-def draw_noise(keys: jax.Array, frames: int, channels: int, prior_dropout: float = 0.0,
-               dtype=jnp.float32) -> StepNoise:
+def draw_noise(keys: jax.Array, frames: int, shape: tuple[int, ...], prior_dropout: float = 0.0, dtype=jnp.float32, *,
+               dropout: bool = False) -> StepNoise:
     """Noise for `frames` observed steps of each sample.
 
     Args:
       keys: typed keys [B].
       frames: T.
-      channels: S, of the stochastic state.
+      shape: of the stochastic state of one sample.
       prior_dropout: probability of going on from the prior sample; 0 outside training.
       dtype: of the normal numbers.
+      dropout: whether each step gets a key for dropout inside the transition.
 
     Returns:
       StepNoise [B, T, ...]; frame t of a sample depends on its key and on t only.
     """
     def step(key):
         key_prior, key_posterior, key_coin = jax.random.split(key, 3)
-        return StepNoise(jax.random.normal(key_prior, (channels,), dtype),
-                         jax.random.normal(key_posterior, (channels,), dtype),
-                         jax.random.bernoulli(key_coin, prior_dropout))
+        return StepNoise(jax.random.normal(key_prior, shape, dtype), jax.random.normal(key_posterior, shape, dtype),
+                         jax.random.bernoulli(key_coin, prior_dropout),
+                         jax.random.fold_in(key, _DROPOUT_SITE) if dropout else None)
 
     return jax.vmap(jax.vmap(step))(jax.vmap(lambda key: _fold_each(key, frames))(keys))
 
 
-def silence(batch_size: int, frames: int, channels: int) -> StepNoise:
-    """The noise of the mean mode: zeros [B, T, ...]."""
-    zeros = jnp.zeros((batch_size, frames, channels), jnp.float32)
-    return StepNoise(zeros, zeros, jnp.zeros((batch_size, frames), jnp.bool_))
+def mean_mode(noise: StepNoise) -> StepNoise:
+    """The same randomness with latents at their means: zeros for the normal numbers, no coins, dropout as it was."""
+    zeros = jnp.zeros_like(noise.prior)
+    return StepNoise(zeros, zeros, jnp.zeros_like(noise.use_prior), noise.dropout)
 
 
 def filter_embeddings(model: WorldModel, variables: Variables, embedding: jax.Array, action: ArrayLike,
@@ -92,11 +94,10 @@ def observe_window(model: WorldModel, variables: Variables, batch: Batch, keys: 
     """
     fold = jax.vmap(jax.random.fold_in, (0, None))
     embedding, batch_stats = model.encode(variables, batch, train=train, keys=fold(keys, 0), axis_name=axis_name)
-    channels = model.config.stochastic_channels
-    if sampled:
-        noise = draw_noise(fold(keys, 1), batch.frames, channels, model.config.prior_dropout if train else 0.0)
-    else:
-        noise = silence(batch.batch_size, batch.frames, channels)
+    shape = model.initial_state(1).stochastic.shape[1:]
+    noise = draw_noise(fold(keys, 1), batch.frames, shape, model.config.prior_dropout if train else 0.0, dropout=train)
+    if not sampled:
+        noise = mean_mode(noise)
     return filter_embeddings(model, variables, embedding, batch.action, batch.is_first, noise), batch_stats
 
 
@@ -126,8 +127,9 @@ def imagine(model: WorldModel, variables: Variables, key: jax.Array, state: Late
       key: typed key, or one per sample [B]; branch n of a sample uses fold_in(key, n), step k of it fold_in(key, k).
       state: LatentState [B, ...], for example Observed.last.
       actions_or_policy: actions [B, H, 2] or [B, N, H, 2], the first one being applied at `state`; or a policy, called
-        for each sample and step as policy(key, features [D + S]) -> action [2] under vmap. Give a policy that has
-        parameters as jax.tree_util.Partial(function, parameters), so that new parameters do not compile anew.
+        for each sample and step as policy(key, features [D + S]) -> action [2] under vmap (features [N, 2 C] with the
+        2D latent, of which WorldModel.policy_features makes one vector). Give a policy that has parameters as
+        jax.tree_util.Partial(function, parameters), so that new parameters do not compile anew.
       horizon: H; needed with a policy, otherwise checked.
       branches: N futures of each state; results have the axes [B, N, H, ...]. Inferred from actions with four axes.
       sampled: sample the latents; otherwise take their means.
@@ -212,7 +214,7 @@ def _imagine(model, variables, keys, state, driver, horizon, branches, sampled):
 
 
 def _imagine_flat(model, variables, keys, state, driver, horizon, sampled):
-    channels = model.config.stochastic_channels
+    shape = state.stochastic.shape[1:]
 
     def step(state, inputs):
         index, action = inputs
@@ -220,7 +222,7 @@ def _imagine_flat(model, variables, keys, state, driver, horizon, sampled):
         if callable(driver):
             action = jax.vmap(driver)(jax.vmap(jax.random.fold_in, (0, None))(step_keys, 1), state.features)
         if sampled:
-            noise = jax.vmap(lambda key: jax.random.normal(jax.random.fold_in(key, 0), (channels,)))(step_keys)
+            noise = jax.vmap(lambda key: jax.random.normal(jax.random.fold_in(key, 0), shape))(step_keys)
         else:
             noise = jnp.zeros_like(state.stochastic)
         state, prior = model.imagine_step(variables, noise, action, state)

@@ -1,11 +1,6 @@
-"""The recurrent state-space model with a vector state (paper section III-C, the 1D latent).
+"""The recurrent state-space model with a vector state (paper section III-C, the 1D latent), and the registry of both.
 
-A step is deterministic given its noise. Every transition of the registry offers the same three things: `initial_state`,
-`observe_step` and `imagine_step`, over muvo_jax.types.LatentState and Gaussian.
-
-The action enters the prior and the posterior, not the recurrence, as in the reference. Differs from the reference in
-the slope of its leaky ReLUs, 0.01 here and 1 there (numerics="reference"), and in drawing the RSSM dropout's coin per
-sample instead of per batch.
+Every transition offers what muvo_jax.model.filtering describes, over muvo_jax.types.LatentState and Gaussian.
 """
 
 from __future__ import annotations
@@ -16,20 +11,9 @@ import numpy as np
 from flax import linen
 
 from muvo_jax.config import ModelConfig
-from muvo_jax.model import common
+from muvo_jax.model import common, filtering, token_transition
 from muvo_jax.nn import layers
-from muvo_jax.types import Gaussian, LatentState, StepNoise
-
-LEAKY_SLOPE = {"standard": 0.01, "reference": 1.0}
-# A fresh model's raw standard deviation: 2 sigmoid(-4 / 2) + 0.1 = 0.34. At 0, which gives 1.1, the noise of the first
-# steps hides what the latent says, and it is long ignored. Trained weights bring their own.
-_INITIAL_RAW_STD = -4.0
-
-
-def initial_constants(config: ModelConfig) -> dict[str, np.ndarray]:
-    """Path of a parameter -> its first value: zero means and the first standard deviation of both Gaussian heads."""
-    bias = np.repeat(np.array([0.0, _INITIAL_RAW_STD], np.float32), config.stochastic_channels)
-    return {f"transition/{head}/out/bias": bias for head in ("prior", "posterior")}
+from muvo_jax.types import Gaussian, LatentState
 
 
 class GRUCell(linen.Module):
@@ -57,10 +41,7 @@ class GRUCell(linen.Module):
 
 
 class GaussianHead(linen.Module):
-    """[..., C] and an action [..., 2] -> Gaussian [..., channels]: action embedding, two dense layers.
-
-    std = 2 sigmoid(raw / 2) + 0.1 lies in (0.1, 2.1).
-    """
+    """[..., C] and an action [..., 2] -> Gaussian [..., channels]: action embedding, two dense layers."""
 
     channels: int
     action_channels: int
@@ -73,48 +54,46 @@ class GaussianHead(linen.Module):
         joined = jnp.concatenate([x.astype(embedded.dtype), jax.nn.leaky_relu(embedded, self.slope)], axis=-1)
         hidden = layers.Dense(joined.shape[-1], self.compute, name="hidden")(joined)
         out = layers.Dense(2 * self.channels, self.compute, name="out")(jax.nn.leaky_relu(hidden, self.slope))
-        mean, raw = jnp.split(out.astype(jnp.float32), 2, axis=-1)
-        return Gaussian(mean, 2.0 * jax.nn.sigmoid(raw / 2.0) + 0.1)
+        return filtering.gaussian(out)
 
 
-class VectorTransition(linen.Module):
-    """1D: h' = GRU(f(s), h); prior(h', action), posterior(h', embedding, action)."""
-
-    config: ModelConfig
+class VectorTransition(filtering.Transition):
+    """1D: h' = GRU(f(s), h); prior(h', action), posterior(h', embedding, action); no dropout inside."""
 
     def setup(self):
         config, compute = self.config, common.compute(self.config)
-        self.slope = LEAKY_SLOPE[config.numerics]
+        self.slope = filtering.LEAKY_SLOPE[config.numerics]
         self.pre_gru = layers.Dense(config.deterministic_channels, compute)
         self.gru = GRUCell(config.deterministic_channels, compute)
         head = lambda: GaussianHead(config.stochastic_channels, config.action_channels, self.slope, compute)
         self.prior, self.posterior = head(), head()
 
     @staticmethod
-    def initial_state(config: ModelConfig, batch_size: int) -> LatentState:
-        """The zero state, [batch_size, ...], before anything was seen."""
-        return LatentState(jnp.zeros((batch_size, config.deterministic_channels), jnp.float32),
-                           jnp.zeros((batch_size, config.stochastic_channels), jnp.float32))
+    def state_shapes(config: ModelConfig) -> tuple[tuple[int, ...], tuple[int, ...]]:
+        return (config.deterministic_channels,), (config.stochastic_channels,)
 
-    def observe_step(self, noise: StepNoise, action: jax.Array, state: LatentState, embedding: jax.Array,
-                     is_first: jax.Array) -> tuple[LatentState, tuple[Gaussian, Gaussian]]:
-        """One step with an observation; see WorldModel.observe_step."""
-        fresh = jnp.expand_dims(is_first, -1)
-        state = jax.tree.map(lambda leaf: jnp.where(fresh, jnp.zeros_like(leaf), leaf), state)
-        action = jnp.where(fresh, jnp.zeros_like(action), action)
-        imagined, prior = self.imagine_step(noise.prior, action, state)
-        deterministic = imagined.deterministic
-        posterior = self.posterior(jnp.concatenate([deterministic, embedding], axis=-1), action)
-        from_prior = jnp.expand_dims(noise.use_prior & ~is_first, -1)
-        stochastic = jnp.where(from_prior, imagined.stochastic, posterior.sample(noise.posterior))
-        return LatentState(deterministic, stochastic), (prior, posterior)
+    @staticmethod
+    def initial_constants(config: ModelConfig) -> dict[str, np.ndarray]:
+        bias = filtering.initial_moments(config.stochastic_channels)
+        return {f"{head}/out/bias": bias for head in ("prior", "posterior")}
 
-    def imagine_step(self, noise: jax.Array, action: jax.Array, state: LatentState) -> tuple[LatentState, Gaussian]:
-        """One step without an observation; see WorldModel.imagine_step."""
-        recurrent_input = jax.nn.leaky_relu(self.pre_gru(state.stochastic), self.slope)
-        deterministic = self.gru(state.deterministic, recurrent_input)
-        prior = self.prior(deterministic, action)
-        return LatentState(deterministic, prior.sample(noise)), prior
+    def recur(self, state: LatentState) -> jax.Array:
+        return self.gru(state.deterministic, jax.nn.leaky_relu(self.pre_gru(state.stochastic), self.slope))
+
+    def predict(self, deterministic: jax.Array, action: jax.Array, keys: jax.Array | None) -> Gaussian:
+        del keys
+        return self.prior(deterministic, action)
+
+    def infer(self, deterministic: jax.Array, embedding: jax.Array, action: jax.Array,
+              keys: jax.Array | None) -> Gaussian:
+        del keys
+        return self.posterior(jnp.concatenate([deterministic, embedding], axis=-1), action)
 
 
-REGISTRY = {"1d": VectorTransition}
+REGISTRY: dict[str, type[filtering.Transition]] = {"1d": VectorTransition, "2d": token_transition.TokenTransition}
+
+
+def initial_constants(config: ModelConfig) -> dict[str, np.ndarray]:
+    """Path of a parameter -> its first value, for the latent that this model has."""
+    constants = REGISTRY[config.latent].initial_constants(config)
+    return {f"transition/{name}": value for name, value in constants.items()}

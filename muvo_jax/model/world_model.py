@@ -19,7 +19,7 @@ import jax.numpy as jnp
 from flax import linen
 
 from muvo_jax.config import ModelConfig
-from muvo_jax.model import camera, common, fusion, heads, lidar, measurements, outputs, transition
+from muvo_jax.model import camera, fusion, heads, lidar, measurements, outputs, tokens, transition
 from muvo_jax.nn import init as init_lib
 from muvo_jax.nn import norm
 from muvo_jax.types import Batch, Gaussian, LatentState, Predictions, StepNoise, Variables
@@ -64,10 +64,14 @@ class Network(linen.Module):
         return self.transition.imagine_step(*args)
 
     def decode(self, features: jax.Array, names: tuple[str, ...]) -> Predictions:
-        raw = {name: self.decoders[name](features) for name in names}
+        raw = {name: self.decoders[name](self.read(features, name)) for name in names}
         if self.config.first_guess == "training_mean":
             raw |= {name: guess(raw[name]) for name, guess in self.first_guess.items() if name in names}
         return raw
+
+    def read(self, features: jax.Array, head: str) -> jax.Array:
+        """The part of the features that a head decodes: its group of tokens with the 2D latent."""
+        return tokens.read(features, heads.TABLE[head].tokens, self.config) if self.config.latent == "2d" else features
 
     def everything(self, frames: dict[str, jax.Array], noise: StepNoise, action: jax.Array, state: LatentState,
                    is_first: jax.Array) -> Predictions:
@@ -86,9 +90,22 @@ class WorldModel:
     config: ModelConfig
 
     @property
-    def feature_channels(self) -> int:
-        """Channels of LatentState.features, what decoders and policies read."""
-        return common.feature_channels(self.config)
+    def feature_shape(self) -> tuple[int, ...]:
+        """Shape of one state's LatentState.features, what decoders read: (D + S,), or (N, 2 C) with the 2D latent."""
+        return jax.eval_shape(lambda: self.initial_state(1).features).shape[1:]
+
+    def policy_features(self, features: jax.Array) -> jax.Array:
+        """What a policy reads, one vector [..., P] whatever the latent, of LatentState.features [..., *feature_shape].
+
+        With the 1D latent the features themselves; with the 2D latent the mean over the tokens of each group side by
+        side, the action's token last (muvo_jax.model.tokens).
+        """
+        return tokens.pool(features, self.config) if self.config.latent == "2d" else features
+
+    @property
+    def policy_feature_channels(self) -> int:
+        """P of `policy_features`."""
+        return jax.eval_shape(self.policy_features, jax.ShapeDtypeStruct(self.feature_shape, jnp.float32)).shape[-1]
 
     def variable_shapes(self) -> dict[str, Any]:
         """The variables as jax.ShapeDtypeStruct leaves."""
@@ -123,7 +140,7 @@ class WorldModel:
           axis_name: mapped axis over which the batch is split; BatchNorm is synchronised over it.
 
         Returns:
-          embedding float32 [B, T, E] and the (updated) batch_stats.
+          embedding float32 [B, T, E], tokens [B, T, M, C] with the 2D latent, and the (updated) batch_stats.
 
         Raises:
           ValueError: if the batch lacks a modality or has other sizes than the configuration, or keys are missing.
@@ -144,7 +161,7 @@ class WorldModel:
             batch_stats = updated["batch_stats"]
         else:
             embedding = self._apply(variables, "encode", frames, mode, None)
-        return embedding.reshape(batch.batch_size, batch.frames, -1), batch_stats
+        return embedding.reshape(batch.batch_size, batch.frames, *embedding.shape[1:]), batch_stats
 
     def initial_state(self, batch_size: int) -> LatentState:
         """The zero state [batch_size, ...], before anything was seen."""
@@ -159,7 +176,7 @@ class WorldModel:
           noise: StepNoise [B, ...]; zeros give the mean mode.
           action: [B, 2], the PREVIOUS action, applied between the last observation and this one.
           state: LatentState [B, ...].
-          embedding: [B, E] of this observation.
+          embedding: [B, E] ([B, M, C] with the 2D latent) of this observation.
           is_first: bool [B]; where true, state and action are replaced by zeros and the RSSM dropout is off.
 
         Returns:
@@ -170,11 +187,14 @@ class WorldModel:
 
     def imagine_step(self, variables: Variables, noise: jax.Array, action: jax.Array,
                      state: LatentState) -> tuple[LatentState, Gaussian]:
-        """Moves the state [B, ...] one step by action [B, 2] alone; noise: standard normal [B, S], or zeros."""
+        """Moves the state [B, ...] one step by action [B, 2] alone.
+
+        noise: standard normal numbers of the shape of the stochastic state, or zeros.
+        """
         return self._apply(variables, "imagine_step", noise, action, state)
 
     def decode(self, variables: Variables, features: jax.Array, heads: Sequence[str] | None = None) -> Predictions:
-        """Decodes latent features [..., D + S] with any leading axes.
+        """Decodes latent features [..., *feature_shape] with any leading axes.
 
         Args:
           variables: of this model.
@@ -186,15 +206,19 @@ class WorldModel:
           range_view in metres, occupancy as logits [..., X, Y, Z, 2], action in (-1, 1) [..., 2] at scale 1.
 
         Raises:
-          ValueError: for a head that the model does not have.
+          ValueError: for a head that the model does not have, or features of another shape.
         """
         names = self.config.heads if heads is None else tuple(heads)
         unknown = [name for name in names if name not in self.config.heads]
         if unknown:
             raise ValueError(f"decode: this model has no head {', '.join(unknown)}; "
                              f"it has {', '.join(self.config.heads)}.")
-        lead = features.shape[:-1]
-        flat = self._apply(variables, "decode", features.reshape(-1, features.shape[-1]), names)
+        shape = self.feature_shape
+        lead = features.shape[:-len(shape)]
+        if features.shape[len(lead):] != shape:
+            raise ValueError(f"decode: got features {list(features.shape)}, expected "
+                             f"[{', '.join(map(str, ('...', *shape)))}] for the {self.config.latent} latent.")
+        flat = self._apply(variables, "decode", features.reshape(-1, *shape), names)
         return {name: {scale: _finished(value, name, scale, self.config).reshape(*lead, *value.shape[1:])
                        for scale, value in scales.items()} for name, scales in flat.items()}
 
@@ -239,9 +263,8 @@ def _variable_shapes(network: Network) -> dict[str, Any]:
               "range_view": jax.ShapeDtypeStruct((1, *range_size, 4), jnp.float32),
               "route_map": jax.ShapeDtypeStruct((1, *ROUTE_MAP_SIZE), jnp.uint8),
               "speed_mps": jax.ShapeDtypeStruct((1,), jnp.float32)}
-    state = jax.eval_shape(lambda: WorldModel(config).initial_state(1))
-    noise = jax.eval_shape(lambda: StepNoise(jnp.zeros((1, config.stochastic_channels)),
-                                             jnp.zeros((1, config.stochastic_channels)), jnp.zeros((1,), jnp.bool_)))
+    state = WorldModel(config).initial_state(1)
+    noise = StepNoise(state.stochastic, state.stochastic, jnp.zeros((1,), jnp.bool_))
     action = jax.ShapeDtypeStruct((1, 2), jnp.float32)
     init = functools.partial(network.init, method="everything")
     return jax.eval_shape(init, jax.random.key(0), frames, noise, action, state,

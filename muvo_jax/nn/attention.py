@@ -1,4 +1,5 @@
-"""Sine positions and the post-norm transformer encoder that fuses the sensors' tokens (paper section III-B).
+"""Sine positions and post-norm transformers: the encoder that fuses the sensors' tokens (paper section III-B), and the
+decoder in which learned queries read the 2D latent's next state (section III-C).
 
 Dropout masks are drawn from one key per sample (row of the batch), so that they do not depend on how a batch is split
 over devices.
@@ -57,19 +58,40 @@ def dropout(x: jax.Array, keys: jax.Array | None, site: int, rate: float) -> jax
     return jnp.where(keep, x / (1.0 - rate), jnp.zeros_like(x))
 
 
-class SelfAttention(linen.Module):
-    """Multi-head attention of tokens [N, L, C] on themselves; the softmax is computed in float32."""
+class InProjection(linen.Module):
+    """Tokens x [N, L, C] and a memory [N, M, C] -> query [N, L, C], key and value [N, M, C]."""
+
+    compute: layers.Compute = layers.Compute()
+
+    @linen.compact
+    def __call__(self, x: jax.Array, memory: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+        channels, dtype = x.shape[-1], self.compute.dtype
+        kernel = self.param("kernel", layers.shape_only, (channels, 3 * channels)).astype(dtype)
+        bias = self.param("bias", layers.shape_only, (3 * channels,)).astype(dtype)
+        affine = lambda values, part: jnp.dot(values.astype(dtype), kernel[:, part]) + bias[part][None, None]
+        if memory is x:
+            query, key, value = jnp.split(affine(x, slice(None)), 3, axis=-1)
+            return query, key, value
+        key, value = jnp.split(affine(memory, slice(channels, None)), 2, axis=-1)
+        return affine(x, slice(channels)), key, value
+
+
+class Attention(linen.Module):
+    """Multi-head attention of tokens x [N, L, C] on a memory [N, M, C]; the softmax is computed in float32.
+
+    With `memory is x` it is self-attention.
+    """
 
     heads: int
     dropout_rate: float
     compute: layers.Compute = layers.Compute()
 
     @linen.compact
-    def __call__(self, x: jax.Array, keys: jax.Array | None, site: int) -> jax.Array:
+    def __call__(self, x: jax.Array, memory: jax.Array, keys: jax.Array | None, site: int) -> jax.Array:
         count, length, channels = x.shape
         head_channels = channels // self.heads
-        projected = layers.Dense(3 * channels, self.compute, name="in_proj")(x)
-        query, key, value = jnp.moveaxis(projected.reshape(count, length, 3, self.heads, head_channels), 2, 0)
+        query, key, value = (part.reshape(count, -1, self.heads, head_channels)
+                             for part in InProjection(self.compute, name="in_proj")(x, memory))
         scores = jnp.einsum("nqhc,nkhc->nhqk", query, key, preferred_element_type=jnp.float32)
         weights = dropout(jax.nn.softmax(scores / math.sqrt(head_channels), axis=-1), keys, site, self.dropout_rate)
         mixed = jnp.einsum("nhqk,nkhc->nqhc", weights.astype(value.dtype), value)
@@ -87,7 +109,7 @@ class EncoderLayer(linen.Module):
     @linen.compact
     def __call__(self, x: jax.Array, keys: jax.Array | None, first_site: int) -> jax.Array:
         drop = lambda value, offset: dropout(value, keys, first_site + offset, self.dropout_rate)
-        attended = SelfAttention(self.heads, self.dropout_rate, self.compute, name="self_attn")(x, keys, first_site)
+        attended = Attention(self.heads, self.dropout_rate, self.compute, name="self_attn")(x, x, keys, first_site)
         x = norm.LayerNorm(name="norm1")(x + drop(attended, 1))
         hidden = jax.nn.relu(layers.Dense(self.hidden_channels, self.compute, name="linear1")(x))
         out = layers.Dense(x.shape[-1], self.compute, name="linear2")(drop(hidden, 2))
@@ -114,4 +136,50 @@ class TransformerEncoder(linen.Module):
         for index in range(self.layers_count):
             x = EncoderLayer(self.heads, self.hidden_channels, self.dropout_rate, self.compute,
                              name=f"layer{index}")(x, keys, SITES_PER_LAYER * index)
+        return x
+
+
+class DecoderLayer(linen.Module):
+    """Post-norm layer over x and a memory: self-attention, attention on the memory, feed-forward with ReLU inside."""
+
+    heads: int
+    hidden_channels: int
+    dropout_rate: float
+    first_site: int
+    compute: layers.Compute = layers.Compute()
+
+    @linen.compact
+    def __call__(self, x: jax.Array, memory: jax.Array, keys: jax.Array | None) -> jax.Array:
+        drop = lambda value, offset: dropout(value, keys, self.first_site + offset, self.dropout_rate)
+        attend = lambda name: Attention(self.heads, self.dropout_rate, self.compute, name=name)
+        x = norm.LayerNorm(name="norm1")(x + drop(attend("self_attn")(x, x, keys, self.first_site), 1))
+        x = norm.LayerNorm(name="norm2")(x + drop(attend("cross_attn")(x, memory, keys, self.first_site + 2), 3))
+        hidden = jax.nn.relu(layers.Dense(self.hidden_channels, self.compute, name="linear1")(x))
+        out = layers.Dense(x.shape[-1], self.compute, name="linear2")(drop(hidden, 4))
+        return norm.LayerNorm(name="norm3")(x + drop(out, 5))
+
+
+SITES_PER_DECODER_LAYER = 6
+
+
+class TransformerDecoder(linen.Module):
+    """A stack of decoder layers over tokens x [N, L, C] and a memory [N, M, C], no mask and no final norm.
+
+    The backward pass computes each layer anew: the weights of a layer at the paper's size, [N, 8, 1093, 1612], with
+    their dropout, would otherwise be kept for every layer and time step.
+    """
+
+    layers_count: int
+    heads: int
+    hidden_channels: int
+    dropout_rate: float
+    compute: layers.Compute = layers.Compute()
+
+    @linen.compact
+    def __call__(self, x: jax.Array, memory: jax.Array, keys: jax.Array | None = None,
+                 first_site: int = 0) -> jax.Array:
+        layer = linen.remat(DecoderLayer)
+        for index in range(self.layers_count):
+            x = layer(self.heads, self.hidden_channels, self.dropout_rate, first_site + SITES_PER_DECODER_LAYER * index,
+                      self.compute, name=f"layer{index}")(x, memory, keys)
         return x

@@ -9,7 +9,7 @@
 | bias of an adaptive norm's style map | 1 for the scale, 0 for the shift |
 | GRU kernels and biases | uniform within 1 / sqrt(hidden channels) |
 | scale of a norm; its bias | 1; 0 |
-| constant; type_embedding | standard normal; 0 |
+| constant and query_*; type_embedding | standard normal; 0 |
 | running mean; running variance | 0; 1 |
 
 Torch's defaults (uniform within 1 / sqrt(fan_in)) shrink the signal in every dense layer and several times in every
@@ -65,7 +65,7 @@ def _leaf(path: tuple[str, ...], siblings: Mapping[str, tuple[int, ...]], random
     leaf, shape = path[-1], siblings[path[-1]]
     if path[0] == "batch_stats":
         return np.full(shape, 1.0 if leaf == "var" else 0.0, np.float32)
-    if leaf == "constant":
+    if leaf == "constant" or leaf.startswith("query_"):
         return random.standard_normal(shape, np.float32)
     if leaf == "scale":
         return np.ones(shape, np.float32)

@@ -1,7 +1,8 @@
 """Balanced Kullback-Leibler divergence between the posterior and the prior (paper Eq. 1).
 
-The divergence is summed over channels and averaged over batch and time. One share trains the prior towards a fixed
-posterior, the rest trains the posterior towards a fixed prior.
+The divergence is summed over the channels of the 1D latent and averaged over batch and time. With the 2D latent it is
+summed over the tokens and averaged over their channels too, as in the reference, so that one weight serves both. One
+share trains the prior towards a fixed posterior, the rest trains the posterior towards a fixed prior.
 
 Standard: KL(posterior_t || prior_t) at every t; the first prior is that of the zero state. The reference leaves the
 first prior out and compares the first posterior with N(0, 1), and by a slip of an index it takes the posterior's std of
@@ -18,19 +19,19 @@ from muvo_jax.objectives import regression
 
 
 def gaussian_kl(posterior: types.Gaussian, prior: types.Gaussian) -> types.Array:
-    """KL(posterior || prior) of diagonal Gaussians, summed over the last axis: [..., S] to [...]."""
+    """KL(posterior || prior) of Gaussians [B, T, S] or [B, T, N, C], summed over S or N: to [B, T] or [B, T, C]."""
     precision = 1.0 / prior.std
     spread = jnp.square(posterior.std * precision)
     shift = jnp.square((posterior.mean - prior.mean) * precision)
-    return (0.5 * (spread + shift - 1.0) - jnp.log(posterior.std * precision)).sum(axis=-1)
+    return (0.5 * (spread + shift - 1.0) - jnp.log(posterior.std * precision)).sum(axis=2)
 
 
 def balanced_kl_sums(posterior: types.Gaussian, prior: types.Gaussian, *, balance: float,
                      numerics: str = "standard") -> regression.MeanSums:
-    """Sums of the balanced divergence over batch and time.
+    """Sums of the balanced divergence over batch and time (and the channels of tokens).
 
     Args:
-      posterior, prior: Gaussian [B, T, ..., S], float32.
+      posterior, prior: Gaussian [B, T, S] or [B, T, N, C], float32.
       balance: share that trains the prior; the value does not depend on it, the gradient does.
       numerics: "standard" or "reference", see the module.
 

@@ -57,6 +57,22 @@ def state_dict():
     ("decoders_occupancy/up_4/conv2/norm/style/kernel", "voxel_decoder.conv1.conv2.adaptive_norm.latent_affine.weight"),
     ("decoders_occupancy/first_conv/conv/kernel", "voxel_decoder.first_conv.conv_act.0.weight"),
     ("decoders_action/mlp/linear3/kernel", "policy.fc.6.weight"),
+    ("transition/type_embedding", "rssm.type_embeddings"),
+    ("transition/prior/type_embedding", "rssm.prior.type_embeddings"),
+    ("transition/prior/query_action", "rssm.prior.query_embed_policy"),
+    ("transition/posterior/query_range_view", "rssm.posterior.query_embed_lidar"),
+    ("transition/prior/transformer/layer3/cross_attn/in_proj/kernel",
+     "rssm.prior.module.layers.3.multihead_attn.in_proj_weight"),
+    ("transition/posterior/transformer/layer0/norm3/scale", "rssm.posterior.module.layers.0.norm3.weight"),
+    ("transition/posterior/moments/bias", "rssm.posterior.fc.bias"),
+    ("transition/posterior_action/kernel", "rssm.posterior_action_module.0.weight"),
+    ("transition/gru/new_shared/kernel", "rssm.recurrent_model.conv_q_glo.weight"),
+    ("transition/gru/gate/bias", "rssm.recurrent_model.w.bias"),
+    ("decoders_image/pre1/conv/bias", "rgb_decoder.pre_transpose_conv.3.0.bias"),
+    ("decoders_occupancy/first/kernel", "voxel_decoder.pre_transpose_conv.0.weight"),
+    ("decoders_occupancy/pre0/conv/transposed_kernel", "voxel_decoder.pre_transpose_conv.2.weight"),
+    ("decoders_occupancy/grow_2/conv/transposed_kernel", "voxel_decoder.trans_conv2.0.weight"),
+    ("decoders_range_view/head_1/kernel", "lidar_re.head_1.lidar_re_head.0.weight"),
 ])
 def test_names_by_hand(ours, theirs):
     assert names.reference_key(ours) == theirs
@@ -65,6 +81,12 @@ def test_names_by_hand(ours, theirs):
 def test_names_are_distinct(state_dict):
     shapes = world_model.WorldModel(CONFIG).variable_shapes()
     assert len(state_dict) == len(jax.tree.leaves(shapes)) + 2
+
+
+def test_queries_become_tokens():
+    grid = np.arange(24.0).reshape(1, 4, 2, 3)  # torch: one row of 4 channels over a grid of 2 x 3
+    np.testing.assert_array_equal(names.to_our_layout("query_image", (6, 4), grid)[5], [5, 11, 17, 23])
+    np.testing.assert_array_equal(names.to_our_layout("query_action", (1, 4), np.ones((1, 1, 4))), np.ones((1, 4)))
 
 
 def test_layouts(state_dict):

@@ -70,12 +70,12 @@ def test_a_samples_noise_depends_on_its_key_alone(variables):
     whole = rollout.observe(MODEL, variables, keys, make_batch())
     swapped = jax.tree.map(lambda leaf: leaf[::-1], make_batch())
     close(rollout.observe(MODEL, variables, keys[::-1], swapped)[0], whole[1])
-    noise = rollout.draw_noise(keys, 5, 3, 0.5)
-    close(rollout.draw_noise(keys[1:], 2, 3, 0.5), noise[1:, :2], 0)
+    noise = rollout.draw_noise(keys, 5, (3,), 0.5)
+    close(rollout.draw_noise(keys[1:], 2, (3,), 0.5), noise[1:, :2], 0)
 
 
 def test_noise_is_standard_normal_and_its_coin_fair():
-    noise = rollout.draw_noise(jax.random.split(jax.random.key(9), 20), 50, 40, 0.15)
+    noise = rollout.draw_noise(jax.random.split(jax.random.key(9), 20), 50, (40,), 0.15)
     for drawn in (noise.prior, noise.posterior):
         np.testing.assert_allclose([drawn.mean(), drawn.std()], [0, 1], atol=0.02)
     assert abs(np.corrcoef(noise.prior.ravel(), noise.posterior.ravel())[0, 1]) < 0.02
@@ -96,7 +96,7 @@ def test_imagine_equals_a_loop_by_hand(variables, state, actions):
 def test_branches_are_independent_futures(variables, state, actions):
     fan = jnp.stack([actions, -actions, actions], axis=1)
     dream = rollout.imagine(MODEL, variables, jax.random.key(1), state, fan, sampled=False)
-    assert dream.features.shape == (BATCH, 3, HORIZON, MODEL.feature_channels)
+    assert dream.features.shape == (BATCH, 3, HORIZON, *MODEL.feature_shape)
     close(dream[:, 0], dream[:, 2])
     close(dream[:, 1], rollout.imagine(MODEL, variables, jax.random.key(1), state, -actions, sampled=False))
     sampled = rollout.imagine(MODEL, variables, jax.random.key(1), state, actions, branches=3)

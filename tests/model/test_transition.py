@@ -29,7 +29,7 @@ def window():
     embedding = jax.random.normal(jax.random.key(2), (BATCH, FRAMES, CONFIG.embedding_channels))
     action = jax.random.uniform(jax.random.key(3), (BATCH, FRAMES, 2), minval=-1.0)
     is_first = jnp.zeros((BATCH, FRAMES), bool).at[:, 0].set(True)
-    return embedding, action, is_first, rollout.draw_noise(keys, FRAMES, CHANNELS, 0.5)
+    return embedding, action, is_first, rollout.draw_noise(keys, FRAMES, (CHANNELS,), 0.5)
 
 
 def test_gru_by_hand():

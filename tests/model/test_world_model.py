@@ -69,7 +69,7 @@ def test_embedding_of_a_sample_does_not_depend_on_the_others_in_evaluation(varia
 
 
 def test_every_head_at_every_scale(variables):
-    features = jax.random.normal(jax.random.key(1), (2, 3, MODEL.feature_channels))
+    features = jax.random.normal(jax.random.key(1), (2, 3, *MODEL.feature_shape))
     predictions = jax.jit(lambda variables, features: MODEL.decode(variables, features))(variables, features)
     full = {"image": CONFIG.image_size, "range_view": (CONFIG.range_view.rows, CONFIG.range_view.columns),
             "occupancy": CONFIG.voxels.shape, "action": ()}
@@ -83,7 +83,7 @@ def test_every_head_at_every_scale(variables):
 
 
 def test_only_the_heads_asked_for_and_any_leading_axes(variables):
-    feature = jnp.ones((MODEL.feature_channels,))
+    feature = jnp.ones(MODEL.feature_shape)
     predictions = MODEL.decode(variables, feature, ("action",))
     assert list(predictions) == ["action"] and predictions["action"][1].shape == (2,)
     with pytest.raises(ValueError, match=r"no head depth; it has image"):
@@ -91,7 +91,7 @@ def test_only_the_heads_asked_for_and_any_leading_axes(variables):
 
 
 def test_range_view_comes_out_in_metres(variables):
-    feature = jnp.ones((1, MODEL.feature_channels))
+    feature = jnp.ones((1, *MODEL.feature_shape))
     doubled = world_model.WorldModel(dataclasses.replace(CONFIG, range_scale_m=2 * CONFIG.range_scale_m))
     range_view = lambda model: model.decode(variables, feature, ("range_view",))["range_view"][4]
     np.testing.assert_allclose(range_view(doubled), 2 * range_view(MODEL), rtol=1e-5)

@@ -74,3 +74,49 @@ def test_dropout_of_a_sample_does_not_depend_on_the_batch():
     whole = encoder.apply(variables, x, keys)
     np.testing.assert_allclose(encoder.apply(variables, x[1:3], keys[1:3]), whole[1:3], atol=1e-5)
     assert not np.allclose(whole, encoder.apply(variables, x), atol=1e-2)
+
+
+def decoder_and_params():
+    decoder = attention.TransformerDecoder(2, 2, 16, 0.5)
+    shapes = jax.eval_shape(decoder.init, jax.random.key(0), jnp.zeros((1, 5, 8)), jnp.zeros((1, 7, 8)))
+    return decoder, init.fill(shapes, jax.random.key(1))
+
+
+def test_decoder_layer_by_hand():
+    layer = attention.DecoderLayer(1, 16, 0.0, 0)
+    draw = lambda seed, length: np.asarray(jax.random.normal(jax.random.key(seed), (1, length, 8)))
+    x, memory = draw(2, 3), draw(3, 4)
+    shapes = jax.eval_shape(layer.init, jax.random.key(0), x, memory, None)
+    params = init.fill(shapes, jax.random.key(1))["params"]
+    dense = lambda value, name: value @ params[name]["kernel"] + params[name]["bias"]
+    normalise = lambda value: (value - value.mean(-1, keepdims=True)) / np.sqrt(value.var(-1, keepdims=True) + 1e-5)
+
+    def attend(name, x, memory):
+        kernel = params[name]["in_proj"]["kernel"]
+        weights = np.exp((x @ kernel[:, :8]) @ (memory @ kernel[:, 8:16]).T / np.sqrt(8))
+        mixed = weights / weights.sum(-1, keepdims=True) @ (memory @ kernel[:, 16:])
+        return mixed @ params[name]["out_proj"]["kernel"]
+
+    y = normalise(x[0] + attend("self_attn", x[0], x[0]))
+    y = normalise(y + attend("cross_attn", y, memory[0]))
+    y = normalise(y + dense(np.maximum(dense(y, "linear1"), 0), "linear2"))
+    np.testing.assert_allclose(layer.apply({"params": params}, x, memory, None)[0], y, rtol=1e-4, atol=1e-5)
+
+
+def test_decoder_reads_its_memory_as_a_set():
+    decoder, variables = decoder_and_params()
+    decode = jax.jit(decoder.apply)
+    x, memory = jax.random.normal(jax.random.key(3), (2, 5, 8)), jax.random.normal(jax.random.key(4), (2, 7, 8))
+    want = decode(variables, x, memory)
+    np.testing.assert_allclose(decode(variables, x, memory[:, ::-1]), want, atol=1e-5)
+    assert not np.allclose(decode(variables, x, 2 * memory), want, atol=1e-2)
+
+
+def test_decoder_dropout_of_a_sample_follows_its_key():
+    decoder, variables = decoder_and_params()
+    decode = jax.jit(decoder.apply)
+    x, memory = jax.random.normal(jax.random.key(3), (2, 5, 8)), jax.random.normal(jax.random.key(4), (2, 7, 8))
+    keys = jax.random.split(jax.random.key(5), 2)
+    dropped = decode(variables, x, memory, keys)
+    np.testing.assert_allclose(decode(variables, x[::-1], memory[::-1], keys[::-1])[::-1], dropped, atol=1e-5)
+    assert not np.allclose(decode(variables, x, memory), dropped, atol=1e-2)

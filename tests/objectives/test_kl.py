@@ -60,12 +60,27 @@ def test_reference_rule_refuses_a_single_frame():
                             numerics="reference")
 
 
+def channels_last(array):
+    """[B, T, C, N] of the reference to [B, T, N, C], and back; [B, T, S] as it is."""
+    return jnp.swapaxes(jnp.asarray(array), 2, -1)
+
+
+def test_tokens_are_summed_and_their_channels_averaged():
+    # N(1, 1) against N(0, 2) in the first of 2 channels, no difference in the second; 3 tokens: 3 * 0.4431 / 2.
+    shift = lambda value, other: jnp.broadcast_to(jnp.float32([value, other]), (2, 4, 3, 2))
+    posterior = types.Gaussian(shift(1.0, 5.0), shift(1.0, 0.5))
+    prior = types.Gaussian(shift(0.0, 5.0), shift(2.0, 0.5))
+    sums = kl.balanced_kl_sums(posterior, prior, balance=0.75)
+    np.testing.assert_allclose(sums.value(), 3 * (np.log(2) - 0.25) / 2, rtol=1e-6)
+    assert sums.count == 2 * 4 * 2
+
+
 @pytest.mark.parametrize("tag, shape", [("1d", (2, 4, 16)), ("2d", (2, 3, 8, 11))])
 @pytest.mark.parametrize("balance", [0.75, 0.5])
 def test_parity_with_the_reference(tag, shape, balance):
     golden = golden_rule.Golden("p1_losses_metrics.npz")
     posterior, prior = (
-        types.Gaussian(*(jnp.asarray(golden_rule.make_input(f"kl_{tag}_{which}_{field}", shape, kind))
+        types.Gaussian(*(channels_last(golden_rule.make_input(f"kl_{tag}_{which}_{field}", shape, kind))
                          for field, kind in (("mu", "normal"), ("sigma", "sigma"))))
         for which in ("posterior", "prior"))
     value = lambda posterior, prior: kl.balanced_kl_sums(posterior, prior, balance=balance,
@@ -74,5 +89,5 @@ def test_parity_with_the_reference(tag, shape, balance):
     entry = f"kl{balance}_{tag}"
     assert golden.error(f"{entry}/loss", loss) < 1e-5
     for which, gradient in zip(("posterior", "prior"), gradients, strict=True):
-        assert golden.error(f"{entry}/grad_{which}_mu", gradient.mean) < 1e-4
-        assert golden.error(f"{entry}/grad_{which}_sigma", gradient.std) < 1e-4
+        assert golden.error(f"{entry}/grad_{which}_mu", channels_last(gradient.mean)) < 1e-4
+        assert golden.error(f"{entry}/grad_{which}_sigma", channels_last(gradient.std)) < 1e-4

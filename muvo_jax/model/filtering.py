@@ -1,0 +1,97 @@
+"""What both transitions have in common: one step of filtering or of imagination, deterministic given its noise.
+
+A subclass says how the state moves and how it looks at actions and observations:
+
+    state_shapes(config)                              shapes of h and s of one sample
+    initial_constants(config)                         first values of some parameters
+    recur(state)                             -> h'    the recurrence
+    predict(h', action, keys)                -> prior
+    infer(h', embedding, action, keys)       -> posterior
+
+As in the reference the action enters the prior and the posterior, not the recurrence. Differs from the reference in
+the slope of the leaky ReLUs, 0.01 here and 1 there (numerics="reference"), and in drawing the RSSM dropout's coin per
+sample instead of per batch.
+"""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import linen
+
+from muvo_jax.config import ModelConfig
+from muvo_jax.types import Gaussian, LatentState, StepNoise
+
+LEAKY_SLOPE = {"standard": 0.01, "reference": 1.0}
+# A fresh model's raw standard deviation: 2 sigmoid(-4 / 2) + 0.1 = 0.34. At 0, which gives 1.1, the noise of the first
+# steps hides what the latent says, and it is long ignored. Trained weights bring their own.
+_INITIAL_RAW_STD = -4.0
+
+
+def gaussian(moments: jax.Array) -> Gaussian:
+    """[..., 2 S] -> Gaussian [..., S] in float32; std = 2 sigmoid(raw / 2) + 0.1 lies in (0.1, 2.1)."""
+    mean, raw = jnp.split(moments.astype(jnp.float32), 2, axis=-1)
+    return Gaussian(mean, 2.0 * jax.nn.sigmoid(raw / 2.0) + 0.1)
+
+
+def initial_moments(channels: int) -> np.ndarray:
+    """First bias [2 channels] of the layer whose output `gaussian` reads: zero means and the first deviation."""
+    return np.repeat(np.array([0.0, _INITIAL_RAW_STD], np.float32), channels)
+
+
+def where(condition: jax.Array, chosen: jax.Array, other: jax.Array) -> jax.Array:
+    """jnp.where for a condition that has the leading axes of the values only."""
+    spread = condition.reshape(condition.shape + (1,) * (other.ndim - condition.ndim))
+    return jnp.where(spread, chosen, other)
+
+
+class Transition(linen.Module):
+    """The interface of muvo_jax.model.transition.REGISTRY, over states [B, ...]."""
+
+    config: ModelConfig
+
+    @staticmethod
+    def state_shapes(config: ModelConfig) -> tuple[tuple[int, ...], tuple[int, ...]]:
+        """Shapes of the deterministic and of the stochastic state of one sample."""
+        raise NotImplementedError
+
+    @staticmethod
+    def initial_constants(config: ModelConfig) -> dict[str, np.ndarray]:
+        """Path of a parameter below "transition" -> its first value."""
+        raise NotImplementedError
+
+    def recur(self, state: LatentState) -> jax.Array:
+        """The next deterministic state."""
+        raise NotImplementedError
+
+    def predict(self, deterministic: jax.Array, action: jax.Array, keys: jax.Array | None) -> Gaussian:
+        """The prior; keys [B] switch dropout on."""
+        raise NotImplementedError
+
+    def infer(self, deterministic: jax.Array, embedding: jax.Array, action: jax.Array,
+              keys: jax.Array | None) -> Gaussian:
+        """The posterior; keys [B] switch dropout on."""
+        raise NotImplementedError
+
+    @classmethod
+    def initial_state(cls, config: ModelConfig, batch_size: int) -> LatentState:
+        """The zero state, [batch_size, ...], before anything was seen."""
+        return LatentState(*(jnp.zeros((batch_size, *shape), jnp.float32) for shape in cls.state_shapes(config)))
+
+    def observe_step(self, noise: StepNoise, action: jax.Array, state: LatentState, embedding: jax.Array,
+                     is_first: jax.Array) -> tuple[LatentState, tuple[Gaussian, Gaussian]]:
+        """One step with an observation; see WorldModel.observe_step."""
+        state = jax.tree.map(lambda leaf: where(is_first, jnp.zeros_like(leaf), leaf), state)
+        action = where(is_first, jnp.zeros_like(action), action)
+        deterministic = self.recur(state)
+        prior = self.predict(deterministic, action, noise.dropout)
+        posterior = self.infer(deterministic, embedding, action, noise.dropout)
+        stochastic = where(noise.use_prior & ~is_first, prior.sample(noise.prior), posterior.sample(noise.posterior))
+        return LatentState(deterministic, stochastic), (prior, posterior)
+
+    def imagine_step(self, noise: jax.Array, action: jax.Array, state: LatentState) -> tuple[LatentState, Gaussian]:
+        """One step without an observation; see WorldModel.imagine_step."""
+        deterministic = self.recur(state)
+        prior = self.predict(deterministic, action, None)
+        return LatentState(deterministic, prior.sample(noise)), prior

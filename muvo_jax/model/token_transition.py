@@ -1,0 +1,116 @@
+"""The recurrent state-space model over tokens (paper section III-C, the 2D latent).
+
+h and s are rows of tokens [B, N, C] (muvo_jax.model.tokens). The recurrence is a GRU of 1x1 convolutions whose gates
+also see a gated mean of all tokens. Prior and posterior are transformer decoders: learned queries, one for each token
+of the state, look at the tokens of h', of the action and, for the posterior, of the observation.
+
+Differs from the reference where the posterior looks at h' without the type embedding that marks it in the prior: an
+omission there, kept by numerics="reference".
+"""
+
+from __future__ import annotations
+
+import math
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import linen
+
+from muvo_jax.config import ModelConfig
+from muvo_jax.model import common, filtering, tokens
+from muvo_jax.nn import attention, layers
+from muvo_jax.types import Gaussian, LatentState
+
+
+class TokenGRU(linen.Module):
+    """(h [B, N, C], x [B, N, C]) -> h': a gated recurrent unit per token, its gates moved by what all tokens share.
+
+    With g the mean over tokens of sigmoid(W [h, x]) * [h, x]:
+    z, r = sigmoid(conv [h, x] + dense g), q = tanh(conv [r * h, x] + dense g), h' = (1 - z) h + z q.
+    """
+
+    channels: int
+    compute: layers.Compute = layers.Compute()
+
+    @linen.compact
+    def __call__(self, state: jax.Array, x: jax.Array) -> jax.Array:
+        dense = lambda name, value, channels=self.channels: layers.Dense(
+            channels, self.compute, name=name)(value).astype(jnp.float32)
+        joined = jnp.concatenate([state, x.astype(jnp.float32)], axis=-1)
+        gate = jax.nn.sigmoid(dense("gate", joined, joined.shape[-1]))
+        shared = jnp.mean(gate * joined, axis=-2, keepdims=True)
+        update = jax.nn.sigmoid(dense("update", joined) + dense("update_shared", shared))
+        reset = jax.nn.sigmoid(dense("reset", joined) + dense("reset_shared", shared))
+        moved = jnp.concatenate([reset * state, joined[..., self.channels:]], axis=-1)
+        new = jnp.tanh(dense("new", moved) + dense("new_shared", shared))
+        return (1.0 - update) * state + update * new
+
+
+class TokenGaussianHead(linen.Module):
+    """Memory [B, M, C] -> Gaussian [B, N, C]: one learned query per token of the state, decoded over the memory."""
+
+    config: ModelConfig
+
+    @linen.compact
+    def __call__(self, memory: jax.Array, keys: jax.Array | None, first_site: int) -> Gaussian:
+        config, compute = self.config, common.compute(self.config)
+        channels, groups = config.token_channels, tokens.groups(config)
+        type_embedding = self.param("type_embedding", layers.shape_only, (len(groups), channels))
+        queries = []
+        for index, (name, grid) in enumerate(groups.items()):
+            query = self.param(f"query_{name}", layers.shape_only, (math.prod(grid), channels))
+            if grid:
+                query = query + jnp.asarray(attention.sine_positions(grid, channels))
+            queries.append(query + type_embedding[index][None])
+        x = jnp.concatenate(queries).astype(compute.dtype)
+        x = jnp.broadcast_to(x[None], (memory.shape[0], *x.shape))
+        x = attention.TransformerDecoder(
+            config.transition_layers, config.transformer_heads, config.transformer_hidden_channels, config.dropout,
+            compute, name="transformer")(x, memory.astype(compute.dtype), keys, first_site)
+        return filtering.gaussian(layers.Dense(2 * channels, compute, name="moments")(x))
+
+
+class TokenTransition(filtering.Transition):
+    """2D: h' = GRU(f(s), h); prior over [h', action], posterior over [h', observation, action], all of them tokens."""
+
+    def setup(self):
+        config, compute = self.config, common.compute(self.config)
+        self.slope = filtering.LEAKY_SLOPE[config.numerics]
+        self.type_embedding = self.param("type_embedding", layers.shape_only, (3, config.token_channels))
+        self.pre_gru = layers.Dense(config.token_channels, compute)
+        self.gru = TokenGRU(config.token_channels, compute)
+        self.prior_action, self.posterior_action = (layers.Dense(config.token_channels, compute) for _ in range(2))
+        self.prior, self.posterior = TokenGaussianHead(config), TokenGaussianHead(config)
+
+    @staticmethod
+    def state_shapes(config: ModelConfig) -> tuple[tuple[int, ...], tuple[int, ...]]:
+        shape = (tokens.count(config), config.token_channels)
+        return shape, shape
+
+    @staticmethod
+    def initial_constants(config: ModelConfig) -> dict[str, np.ndarray]:
+        bias = filtering.initial_moments(config.token_channels)
+        return {f"{head}/moments/bias": bias for head in ("prior", "posterior")}
+
+    def recur(self, state: LatentState) -> jax.Array:
+        return self.gru(state.deterministic, jax.nn.leaky_relu(self.pre_gru(state.stochastic), self.slope))
+
+    def predict(self, deterministic: jax.Array, action: jax.Array, keys: jax.Array | None) -> Gaussian:
+        memory = jnp.concatenate([self._typed(deterministic, 1), self._action(self.prior_action, action)], axis=-2)
+        return self.prior(memory, keys, 0)
+
+    def infer(self, deterministic: jax.Array, embedding: jax.Array, action: jax.Array,
+              keys: jax.Array | None) -> Gaussian:
+        remembered = deterministic if self.config.numerics == "reference" else self._typed(deterministic, 1)
+        memory = jnp.concatenate([remembered, self._typed(embedding, 0), self._action(self.posterior_action, action)],
+                                 axis=-2)
+        return self.posterior(memory, keys, attention.SITES_PER_DECODER_LAYER * self.config.transition_layers)
+
+    def _typed(self, values: jax.Array, kind: int) -> jax.Array:
+        """Marks tokens [B, n, C] as those of the observation (0), of the state (1) or of the action (2)."""
+        return values + layers.per_channel(self.type_embedding[kind], values.ndim)
+
+    def _action(self, embed: layers.Dense, action: jax.Array) -> jax.Array:
+        embedded = jax.nn.leaky_relu(embed(action), self.slope).astype(jnp.float32)
+        return self._typed(jnp.expand_dims(embedded, -2), 2)

@@ -1,0 +1,59 @@
+"""The token groups of the 2D latent: which tokens a state has, which of them a head reads, what a policy reads.
+
+A state is one row of tokens [..., N, C], group after group in the order of `groups`: the cells of the image, of the
+range view and of the voxel grid, each in row-major order, and one token for the action. All groups are there whatever
+the heads, as in the reference, so that a model can gain a head later.
+"""
+
+from __future__ import annotations
+
+import math
+
+import jax
+import jax.numpy as jnp
+
+from muvo_jax.config import ModelConfig
+
+IMAGE_SHRINK, RANGE_VIEW_SHRINK = 32, 16
+
+
+def groups(config: ModelConfig) -> dict[str, tuple[int, ...]]:
+    """Name of a group -> its grid; () is a single token."""
+    view = config.range_view
+    voxel_shrink = 2 ** (config.occupancy_token_stages + 3)
+    return {"image": tuple(side // IMAGE_SHRINK for side in config.image_size),
+            "range_view": (view.rows // RANGE_VIEW_SHRINK, view.columns // RANGE_VIEW_SHRINK),
+            "occupancy": tuple(side // voxel_shrink for side in config.voxels.shape),
+            "action": ()}
+
+
+def count(config: ModelConfig) -> int:
+    """Tokens of a state; 1093 at the paper's sizes."""
+    return sum(math.prod(grid) for grid in groups(config).values())
+
+
+def split(tokens: jax.Array, config: ModelConfig) -> dict[str, jax.Array]:
+    """[..., N, C] -> name of a group -> its tokens [..., n, C]."""
+    parts, start = {}, 0
+    for name, grid in groups(config).items():
+        stop = start + math.prod(grid)
+        parts[name] = tokens[..., start:stop, :]
+        start = stop
+    return parts
+
+
+def read(features: jax.Array, group: str, config: ModelConfig) -> jax.Array:
+    """What the decoder of a head reads: features [..., N, 2 C] -> the group's map [..., *grid, 2 C].
+
+    The paper decodes from the deterministic and the stochastic state; the reference from the stochastic one alone,
+    [..., *grid, C] under numerics="reference".
+    """
+    part = split(features, config)[group]
+    if config.numerics == "reference":
+        part = part[..., part.shape[-1] // 2:]
+    return part.reshape(*part.shape[:-2], *groups(config)[group], part.shape[-1])
+
+
+def pool(features: jax.Array, config: ModelConfig) -> jax.Array:
+    """[..., N, 2 C] -> [..., G * 2 C]: the mean of each group's tokens side by side, the action's token last."""
+    return jnp.concatenate([part.mean(axis=-2) for part in split(features, config).values()], axis=-1)

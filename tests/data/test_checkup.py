@@ -39,7 +39,8 @@ def test_a_sound_drive_has_no_problem():
     (lambda motion: {"yaw_rate_radps": -motion.yaw_rate_radps}, "steering has the wrong sign"),
     (lambda motion: {"action": motion.action * [-1, 1]}, "acceleration has the wrong sign"),
     (lambda motion: {"action": motion.action * [1, 57.3]}, r"steering leaves \[-1, 1\] in \d+ of 100 frames"),
-    (lambda motion: {"action": np.where(np.arange(100)[:, None] == 3, np.nan, motion.action)}, "steering is not finite in 1"),
+    (lambda motion: {"action": np.where(np.arange(100)[:, None] == 3, np.nan, motion.action)},
+     "steering is not finite in 1"),
 ])
 def test_faults_of_actions(change, message):
     motion = drive()

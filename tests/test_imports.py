@@ -22,7 +22,7 @@ ALLOWED = {
     "metrics": BASE | {"nn", "model"},
     "data": BASE,
     "viz": BASE,
-    "interop": BASE | {"model", "data"},
+    "interop": BASE | {"nn", "model", "data"},
     "training": BASE | {"nn", "model", "objectives", "metrics", "data"},
 }
 

@@ -22,7 +22,7 @@ ALLOWED = {
     "metrics": BASE | {"nn", "model"},
     "data": BASE,
     "viz": BASE,
-    "interop": BASE | {"nn", "model", "data"},
+    "interop": BASE | {"nn", "model", "objectives", "metrics", "data", "training", "command_line"},
     "training": BASE | {"nn", "model", "objectives", "metrics", "data"},
 }
 

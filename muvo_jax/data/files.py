@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pathlib
+import struct
 import tomllib
 import warnings
 import zipfile
@@ -16,20 +17,23 @@ from muvo_jax.data import schema
 
 BAD_POINT_SHARE = 0.01  # more non-finite points than this are a broken file, not noise
 GAP_PERIODS = 1.5  # a time step longer than this many periods is a gap
+# Pillow raises any of these for broken chunks and for sizes that would fill the memory.
+_IMAGE_ERRORS = (OSError, SyntaxError, ValueError, TypeError, IndexError, OverflowError, MemoryError, zlib.error,
+                 struct.error, Image.DecompressionBombError)
 
 
-def read_png(path: pathlib.Path, mode: str) -> np.ndarray:
-    """Returns an 8-bit image: [H, W, 3] for mode "RGB", [H, W] for mode "L".
+def read_image(path: pathlib.Path, mode: str | None) -> np.ndarray:
+    """Returns a PNG or JPEG: [H, W, 3] for mode "RGB", [H, W, 4] for "RGBA", [H, W] for "L"; for None as it is stored.
 
     Raises:
       DataError: where the file is missing, truncated or no image.
     """
     try:
         with Image.open(path) as image:
-            return np.asarray(image.convert(mode))
+            return np.asarray(image.convert(mode) if mode else image)
     except FileNotFoundError as error:
         raise missing(path, "an image") from error
-    except (OSError, SyntaxError, ValueError, zlib.error) as error:  # Pillow raises any of these for broken PNG chunks
+    except _IMAGE_ERRORS as error:
         raise schema.DataError(f"{path}: not a readable image ({error}). The file is truncated or damaged: copy it "
                                f"again, or delete it so that the sequence is split there.") from error
 

@@ -16,12 +16,10 @@ import csv
 import dataclasses
 import pathlib
 import warnings
-from collections.abc import Callable
 
 import numpy as np
 
-from muvo_jax import config as config_lib
-from muvo_jax.data import files, schema
+from muvo_jax.data import description, files, schema
 
 SCHEMA_VERSION = 1
 DESCRIPTION_FILE = "recording.toml"
@@ -30,7 +28,7 @@ FRAMES_FILE = "frames.csv"
 _FILES = {"image": ("image", ".png"), "points_m": ("lidar", ".npz"), "occupancy": ("occupancy", ".npz"),
           "route_map": ("route_map", ".png")}
 _COLUMNS = ("frame_id", "timestamp_s", "speed_mps", "acceleration", "steering")
-_OPTIONAL_COLUMNS = ("reward", "is_terminal")
+_OPTIONAL_COLUMNS = ("reward", "is_terminal", "yaw_rad")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -56,32 +54,29 @@ class PlainRecording:
         if header.get("schema_version") != SCHEMA_VERSION:
             raise schema.DataError(f"{toml_path}: schema_version is {header.get('schema_version')!r}, this reader "
                                    f"knows {SCHEMA_VERSION}. Record it again, or use the muvo_jax that wrote it.")
-        splits = tuple(_field(header, "splits", list, toml_path))
+        splits = tuple(description.field(header, "splits", list, toml_path))
         runs = [run for split in splits for run in _read_runs(root, split)]
         if not runs:
             raise schema.DataError(f"{root}: no complete run (a folder <split>/<run> with {FRAMES_FILE}) in the splits "
                                    f"{', '.join(splits)}. The root holds {files.listing(root)}. Record it again.")
-        rate_hz = float(_field(header, "rate_hz", (int, float), toml_path))
+        rate_hz = description.rate_hz(header, toml_path)
         modalities = _modalities(runs)
         self._runs = {f"{run.split}/{run.folder.name}": run for run in runs}
         self.sequences = tuple(sequence for name, run in self._runs.items()
                                for sequence in _cut(run, name, modalities, 1.0 / rate_hz))
-        lidar = _section(header, "lidar", config_lib.RangeViewGeometry, toml_path, "points_m" in modalities)
-        voxels = _section(header, "voxels", config_lib.VoxelGrid, toml_path, "occupancy" in modalities)
-        contract = _section(header, "action", config_lib.ActionContract, toml_path, required=True)
-        camera = _section(header, "camera", schema.Camera, toml_path, "image" in modalities)
-        if camera is not None:
-            _check_matrix(camera.intrinsics, 3, f"{toml_path}: camera.intrinsics")
-            _check_matrix(camera.camera_to_ego, 4, f"{toml_path}: camera.camera_to_ego")
+        lidar = description.section(header, "lidar", toml_path, required="points_m" in modalities)
+        voxels = description.section(header, "voxels", toml_path, required="occupancy" in modalities)
+        contract = description.section(header, "action", toml_path, required=True)
+        camera = description.section(header, "camera", toml_path, required="image" in modalities)
         self.description = schema.RecordingDescription(
-            name=str(_field(header, "name", str, toml_path)), kind="plain", rate_hz=rate_hz, camera=camera, lidar=lidar,
-            voxels=voxels, contract=contract, modalities=modalities, splits=splits)
+            name=str(description.field(header, "name", str, toml_path)), kind="plain", rate_hz=rate_hz, camera=camera,
+            lidar=lidar, voxels=voxels, contract=contract, modalities=modalities, splits=splits)
 
     def read(self, sequence: schema.Sequence, index: int) -> schema.RawFrame:
         """See schema.Recording."""
         run = self._runs[sequence.name]
         position = sequence.start + index
-        columns, description = run.columns, self.description
+        columns, described = run.columns, self.description
         frame_id = int(columns["frame_id"][position])
         frame: schema.RawFrame = {
             "speed_mps": np.float32(columns["speed_mps"][position]),
@@ -89,15 +84,17 @@ class PlainRecording:
             "timestamp_s": np.float64(columns["timestamp_s"][position]),
             "frame_id": np.int64(frame_id),
         }
-        if "reward" in description.modalities:
+        if "yaw_rate_radps" in described.modalities:
+            frame["yaw_rate_radps"] = np.float32(columns["yaw_rate_radps"][position])
+        if "reward" in described.modalities:
             frame["reward"] = np.float32(columns["reward"][position])
-        if "is_terminal" in description.modalities:
+        if "is_terminal" in described.modalities:
             frame["is_terminal"] = np.bool_(columns["is_terminal"][position])
         paths = {key: run.folder / folder / f"{frame_id:06d}{suffix}" for key, (folder, suffix) in _FILES.items()
-                 if key in description.modalities}
-        if description.camera is not None and "image" in paths:
-            camera = description.camera
-            frame["image"] = files.read_png(paths["image"], "RGB")
+                 if key in described.modalities}
+        if described.camera is not None and "image" in paths:
+            camera = described.camera
+            frame["image"] = files.read_image(paths["image"], "RGB")
             _check_shape(frame["image"], (camera.height_px, camera.width_px, 3), paths["image"])
             frame["intrinsics"] = np.asarray(camera.intrinsics, np.float32)
             frame["camera_to_ego"] = np.asarray(camera.camera_to_ego, np.float32)
@@ -105,37 +102,13 @@ class PlainRecording:
             points_m = files.read_npz(paths["points_m"], "points_m")
             _check_shape(points_m, (len(points_m), 3), paths["points_m"])
             frame["points_m"] = files.finite_points(points_m.astype(np.float32, copy=False), paths["points_m"])
-        if description.voxels is not None and "occupancy" in paths:
+        if described.voxels is not None and "occupancy" in paths:
             frame["occupancy"] = files.read_npz(paths["occupancy"], "occupancy").astype(np.uint8, copy=False)
-            _check_shape(frame["occupancy"], description.voxels.shape, paths["occupancy"])
+            _check_shape(frame["occupancy"], described.voxels.shape, paths["occupancy"])
         if "route_map" in paths:
-            frame["route_map"] = files.read_png(paths["route_map"], "L")
+            frame["route_map"] = files.read_image(paths["route_map"], "L")
             _check_shape(frame["route_map"], (64, 64), paths["route_map"])
         return frame
-
-
-def _field(header: dict, name: str, kind: type | tuple[type, ...], path: pathlib.Path):
-    if not isinstance(header.get(name), kind):
-        raise schema.DataError(f"{path}: {name} is {header.get(name)!r}, expected "
-                               f"{getattr(kind, '__name__', 'a number')}.")
-    return header[name]
-
-
-def _section(header: dict, name: str, cls: Callable, path: pathlib.Path, required: bool):
-    """One table of the description as a dataclass; None where it is neither there nor required."""
-    if name not in header:
-        if required:
-            raise schema.DataError(f"{path}: section [{name}] is missing, although there is data that needs it.")
-        return None
-    try:
-        return config_lib.parse(cls, header[name], f"{path}: {name}")
-    except (TypeError, ValueError) as error:
-        raise schema.DataError(str(error)) from error
-
-
-def _check_matrix(rows: tuple[tuple[float, ...], ...], size: int, where: str) -> None:
-    if [len(row) for row in rows] != [size] * size:
-        raise schema.DataError(f"{where}: got {rows}, expected {size} rows of {size} numbers.")
 
 
 def _check_shape(array: np.ndarray, expected: tuple[int, ...], path: pathlib.Path) -> None:
@@ -168,7 +141,15 @@ def _read_table(path: pathlib.Path) -> dict[str, np.ndarray]:
     columns = {name: np.array([_number(path, line, name, row[name]) for line, row in enumerate(rows, start=2)])
                for name in _COLUMNS + optional}
     files.check_increasing(columns["timestamp_s"], [f"{path}, line {line + 2}" for line in range(len(rows))])
+    if "yaw_rad" in columns and len(rows) > 1:
+        columns["yaw_rate_radps"] = _rates(columns.pop("yaw_rad"), columns["timestamp_s"])
     return columns
+
+
+def _rates(yaw_rad: np.ndarray, timestamps_s: np.ndarray) -> np.ndarray:
+    """Turning between a frame and the next (the last frame: as the one before), rad/s."""
+    turned_rad = (np.diff(yaw_rad) + np.pi) % (2 * np.pi) - np.pi
+    return np.append(turned_rad, turned_rad[-1:]) / np.append(np.diff(timestamps_s), np.diff(timestamps_s)[-1:])
 
 
 def _number(path: pathlib.Path, line: int, name: str, text: str | None) -> float:
@@ -187,7 +168,8 @@ def _modalities(runs: list[_Run]) -> frozenset[str]:
     """The keys of RawFrame that at least one run has; where another run lacks one, its frames are left out."""
     names = {"speed_mps", "action", "timestamp_s", "frame_id"}
     names |= {key for key, (folder, _) in _FILES.items() if any((run.folder / folder).is_dir() for run in runs)}
-    names |= {name for name in _OPTIONAL_COLUMNS if all(name in run.columns for run in runs)}
+    names |= {name for name in ("reward", "is_terminal", "yaw_rate_radps")
+              if all(name in run.columns for run in runs)}
     if "image" in names:
         names |= {"intrinsics", "camera_to_ego"}
     return frozenset(names)

@@ -6,7 +6,7 @@ import pathlib
 from collections.abc import Callable
 from typing import NamedTuple
 
-from muvo_jax.data import files, kitti, plain, schema
+from muvo_jax.data import carla, files, kitti, plain, schema
 
 
 class Kind(NamedTuple):
@@ -30,6 +30,8 @@ KINDS = (
          lambda path: (path / plain.DESCRIPTION_FILE).is_file(), plain.PlainRecording),
     Kind("KITTI raw", "<date>/<date>_drive_NNNN_sync folders, or one of them",
          lambda path: bool(kitti.find_drives(path)), kitti.KittiRecording),
+    Kind("MUVO CARLA", f"trainval/<mode>/<Town>/<run> folders with {carla.FRAME_FILE}, or one of them",
+         lambda path: bool(carla.folders(path)), carla.CarlaRecording),
 )
 
 

@@ -114,6 +114,32 @@ def to_our_layout(leaf: str, shape: tuple[int, ...], value: np.ndarray) -> np.nd
     return value
 
 
+def to_reference_layout(path: str, value: np.ndarray) -> np.ndarray:
+    """One of our variables in torch's layout, without the axes of size 1 that only the reference has.
+
+    Args:
+      path: of the variable, "camera/backbone/conv1/kernel"; its last part says what it is.
+      value: the variable; the tokens of a query stay in one axis.
+    """
+    leaf = path.rsplit("/")[-1]
+    if leaf == "type_embedding":
+        return value.T[None, None]
+    if leaf.startswith("query_"):
+        return value[None] if leaf == "query_action" else value.T[None]
+    if leaf == "constant":
+        return np.moveaxis(value, -1, 0)
+    if leaf in ("seed_kernel", "transposed_kernel"):
+        return np.moveaxis(value, (-2, -1), (0, 1))
+    if leaf.endswith("kernel"):
+        return np.moveaxis(value, (-1, -2), (0, 1))
+    return value
+
+
+def reference_shape(path: str, shape: tuple[int, ...]) -> tuple[int, ...]:
+    """The shape that `to_reference_layout` gives to a variable of this shape."""
+    return to_reference_layout(path, np.broadcast_to(np.float32(0), shape)).shape
+
+
 def convert_state_dict(state_dict: Mapping[str, np.ndarray], model_config: ModelConfig) -> dict[str, Any]:
     """Variables of WorldModel(model_config) with the reference's numbers.
 

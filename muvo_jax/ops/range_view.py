@@ -45,13 +45,15 @@ def project(points_m: np.ndarray, geometry: config_lib.RangeViewGeometry) -> np.
       ValueError: for another shape or for points that are not finite.
     """
     points_m = check_points(points_m)
-    relative_m = points_m - np.asarray(geometry.position_m, np.float32)
+    # In float64: two points on one ring of flat ground differ in range by less than float32 tells, and one must win.
+    relative_m = points_m - np.asarray(geometry.position_m, np.float64)[None]
     range_m = np.sqrt(np.einsum("pc,pc->p", relative_m, relative_m))
     here = range_m > 0
     points_m, relative_m, range_m = points_m[here], relative_m[here], range_m[here]
 
-    yaw_rad = np.arctan2(relative_m[:, 1], relative_m[:, 0])
-    elevation_rad = np.arcsin(np.clip(relative_m[:, 2] / range_m, -1.0, 1.0))
+    x, y, z = relative_m.astype(np.float32).T
+    yaw_rad = np.arctan2(y, x)
+    elevation_rad = np.arcsin(np.clip(z / range_m.astype(np.float32), -1.0, 1.0))
     span_rad = geometry.elevation_max_rad - geometry.elevation_min_rad
     column = np.floor(0.5 * (1.0 - yaw_rad / np.float32(np.pi)) * geometry.columns).astype(np.int64)
     row = np.floor((1.0 - (elevation_rad - geometry.elevation_min_rad) / span_rad) * geometry.rows).astype(np.int64)

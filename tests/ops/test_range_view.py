@@ -79,3 +79,11 @@ def test_points_that_are_not_finite_are_refused(bad):
 def test_wrong_shape_is_refused():
     with pytest.raises(ValueError, match=r"\(4, 4\), expected \[points, 3\]"):
         range_view.project(np.zeros((4, 4)), GEOMETRY)
+
+
+def test_of_two_points_at_almost_one_distance_the_nearer_wins():
+    """In float32 both ranges round to the same number; the authors compare in float64."""
+    near, far = np.array([[9.0, 0.0, 2.0]], np.float32), np.array([[9.0, 1e-4, 2.0]], np.float32)
+    for order in ((near, far), (far, near)):
+        image = range_view.project(np.concatenate(order), config_lib.RangeViewGeometry(rows=1, columns=1))
+        np.testing.assert_array_equal(image[0, 0, :3], near[0])

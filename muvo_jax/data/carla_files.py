@@ -1,0 +1,152 @@
+"""The single files of a recording in the MUVO / MILE CARLA layout: what is in them and how to read them.
+
+    image/image_000000012.png                      RGB, 8 bit
+    depth_semantic/depth_semantic_000000012.png    R, G, B: depth, most significant byte first; A: semantic tag
+    birdview/birdview_000000012.png                16 bit grey, a bit field of BIRDVIEW_BITS
+    routemap/routemap_000000012.png                8 bit grey, 255 on the route
+    points_semantic/points_semantic_000000012.npy  pickled dict: points_xyz float32 [N, 3] in the lidar's left-handed
+                                                   frame (x forward, y right, z up), ObjTag unsigned [N]
+    voxel/voxel_000000012.npy                      uint16 [M, 4]: ix, iy, iz, tag of the occupied voxels
+
+Facts from the authors' repository (github.com/fzi-forschungszentrum-informatik/muvo, main).
+"""
+
+from __future__ import annotations
+
+import pathlib
+from typing import NamedTuple
+
+import numpy as np
+
+from muvo_jax import config as config_lib
+from muvo_jax.data import files, safe_pickle, schema
+
+KINDS = {"image": ".png", "depth_semantic": ".png", "birdview": ".png", "routemap": ".png", "points_semantic": ".npy",
+         "voxel": ".npy"}
+DEPTH_RANGE_M = 1000.0
+_DEPTH_STEPS = 256 ** 3 - 1
+BIRDVIEW_BITS = ("background", "road", "lane_marking", "vehicle", "pedestrian", "light_green", "light_yellow",
+                 "light_red")
+# What the lidar sees of its own car: |x| and |y| below the first two, z between 0 and the third (m, ego frame).
+EGO_BOX_M = (2.451, 1.064, 1.511)
+UNLABELLED, PEDESTRIAN, ROAD_LINE, VEHICLE, SKY = 0, 4, 6, 10, 13  # CARLA up to 0.9.13
+UNKNOWN_TAG = 255
+
+
+class Points(NamedTuple):
+    """points_m float32 [N, 3], ego frame; tags uint8 [N], or None where the recording has none."""
+
+    points_m: np.ndarray
+    tags: np.ndarray | None
+
+
+def file_name(kind: str, number: int) -> str:
+    """Path of a frame's file, relative to the run."""
+    return f"{kind}/{kind}_{number:09d}{KINDS[kind]}"
+
+
+def is_occupied(tags: np.ndarray) -> np.ndarray:
+    """Class 1 of the authors' label map: everything but unlabelled and sky. Tags above 22 (CARLA 0.9.14) count too."""
+    return (tags != UNLABELLED) & (tags != SKY) & (tags != UNKNOWN_TAG)
+
+
+def read_depth_semantic(path: pathlib.Path) -> tuple[np.ndarray, np.ndarray]:
+    """Returns the depth along the optical axis, float64 [H, W] in [0, 1] (1 is 1000 m: sky), and tags, uint8 [H, W].
+
+    Raises:
+      DataError: where the file is missing, damaged or has no four channels.
+    """
+    pixels = _read(path, (None, None, 4))
+    return decode_depth(pixels[..., :3]), pixels[..., 3]
+
+
+def decode_depth(pixels: np.ndarray) -> np.ndarray:
+    """uint8 [..., 3], most significant byte first, to float64 [...] in [0, 1]."""
+    red, green, blue = (pixels[..., channel].astype(np.float64) for channel in range(3))
+    return (red * 65536 + green * 256 + blue) / _DEPTH_STEPS
+
+
+def encode_depth(depth_m: np.ndarray) -> np.ndarray:
+    """Metres (beyond 1000 m or infinite: sky) to uint8 [..., 3], the inverse of `decode_depth`."""
+    share = np.clip(np.where(np.isfinite(depth_m), depth_m, DEPTH_RANGE_M) / DEPTH_RANGE_M, 0.0, 1.0)
+    steps = np.rint(share * _DEPTH_STEPS).astype(np.int64)
+    return np.stack([steps >> 16, steps >> 8 & 255, steps & 255], axis=-1).astype(np.uint8)
+
+
+def read_birdview(path: pathlib.Path) -> np.ndarray:
+    """Returns the bit field, uint16 [rows, columns]; bit k is BIRDVIEW_BITS[k].
+
+    Raises:
+      DataError: where the file is missing, damaged or no grey image of whole numbers.
+    """
+    pixels = _read(path, (None, None))
+    return pixels.astype(np.uint16)  # Pillow says int32 or uint16, depending on its version
+
+
+def read_route_map(path: pathlib.Path) -> np.ndarray:
+    """Returns the route from above as it is stored, uint8 [rows, columns], 255 on the route; raises DataError."""
+    return files.read_image(path, "L")
+
+
+def read_points(path: pathlib.Path, lidar_position_m: tuple[float, float, float]) -> Points:
+    """Reads a scan into the ego frame (left-handed to right-handed), without what lies in the recording car's own box.
+
+    Args:
+      lidar_position_m: of the lidar in the ego frame.
+
+    Raises:
+      Refused: where the pickled dict asks for more than arrays.
+      DataError: where the file is missing, damaged or holds no points.
+    """
+    content = safe_pickle.load_npy(path)
+    points_m = content.get("points_xyz") if isinstance(content, dict) else None
+    if not isinstance(points_m, np.ndarray) or points_m.dtype.kind != "f" or points_m.shape[1:] != (3,):
+        raise schema.DataError(f"{path}: expected a dict with points_xyz, floats [N, 3]; found "
+                               f"{sorted(content) if isinstance(content, dict) else type(content).__name__}.")
+    tags = content.get("ObjTag")
+    if tags is not None and not (isinstance(tags, np.ndarray) and tags.dtype.kind == "u" and
+                                 tags.shape == points_m.shape[:1]):
+        raise schema.DataError(f"{path}: ObjTag is no array of {len(points_m)} unsigned numbers.")
+    finite = np.isfinite(points_m).all(axis=1)
+    files.finite_points(points_m, path)
+    x, y, z = (np.float32(value) for value in lidar_position_m)
+    ego_m = points_m.astype(np.float32) + np.array([[x, -y, z]], np.float32)
+    ego_m[:, 1] *= -1
+    keep = finite & ~in_ego_box(ego_m)
+    return Points(ego_m[keep], None if tags is None else tags[keep].astype(np.uint8))
+
+
+def in_ego_box(points_m: np.ndarray) -> np.ndarray:
+    """bool [N], the points strictly inside the recording car."""
+    half_length, half_width, height = EGO_BOX_M
+    x, y, z = points_m[:, 0], points_m[:, 1], points_m[:, 2]
+    return (np.abs(x) < half_length) & (np.abs(y) < half_width) & (z > 0) & (z < height)
+
+
+def read_voxels(path: pathlib.Path, grid: config_lib.VoxelGrid) -> np.ndarray:
+    """Returns occupancy, uint8 [X, Y, Z]: 1 where a voxel holds something that is_occupied, else 0.
+
+    Raises:
+      Refused: where the file is pickled and asks for more than arrays.
+      DataError: where it is missing, damaged, no table of four columns, or beyond the grid.
+    """
+    rows = safe_pickle.load_npy(path)
+    if not isinstance(rows, np.ndarray) or rows.dtype.kind not in "ui" or rows.ndim != 2 or rows.shape[1] != 4:
+        raise schema.DataError(f"{path}: expected whole numbers [M, 4] (ix, iy, iz, tag); make the voxels again.")
+    index = rows[:, :3].astype(np.int64)
+    if (index < 0).any() or (index >= np.asarray(grid.shape)).any():
+        raise schema.DataError(f"{path}: voxel {index[~((index >= 0) & (index < np.asarray(grid.shape))).all(1)][0]} "
+                               f"lies outside a grid of {list(grid.shape)}. Describe the grid in sensors.toml.")
+    occupancy = np.zeros(grid.shape, np.uint8)
+    occupancy[tuple(index.T)] = is_occupied(rows[:, 3])
+    return occupancy
+
+
+def _read(path: pathlib.Path, shape: tuple[int | None, ...]) -> np.ndarray:
+    """An image as it is stored, of whole numbers and of this shape (None: any)."""
+    pixels = files.read_image(path, None)
+    fits = len(shape) == pixels.ndim and all(map(lambda want, side: want in (None, side), shape, pixels.shape))
+    if not fits or pixels.dtype.kind not in "ui":
+        raise schema.DataError(f"{path}: an image {list(pixels.shape)} of {pixels.dtype}, expected "
+                               f"{['any' if side is None else side for side in shape]} of whole numbers.")
+    return pixels

@@ -1,0 +1,76 @@
+"""What a parity check is made of: checks of entries, groups of them, and the packs that groups belong to."""
+
+from __future__ import annotations
+
+import dataclasses
+import pathlib
+import re
+from collections.abc import Callable, Iterator, Mapping
+from typing import Any
+
+from muvo_jax.interop import packs
+
+
+@dataclasses.dataclass(frozen=True)
+class Check:
+    """One entry, computed anew.
+
+    Attributes:
+      entry: its name in the pack; one that the pack lacks is passed over.
+      got: our value, in torch's layout.
+      tolerance: the largest error that passes.
+      measure: (pack, entry, got) -> error; by default that of packs.Pack.error.
+    """
+
+    entry: str
+    got: Any
+    tolerance: float
+    measure: Callable[[packs.Pack, str, Any], float] = packs.Pack.error
+
+
+@dataclasses.dataclass(frozen=True)
+class Context:
+    """What a group of checks may read.
+
+    Attributes:
+      pack: the file under test.
+      settings: seed and sizes of its folder.
+      recordings: folder of recordings, for the packs that need some.
+    """
+
+    pack: packs.Pack
+    settings: packs.Settings
+    recordings: pathlib.Path | None = None
+
+    def draw(self, name: str, shape: tuple[int, ...], kind: str):
+        """An input by the rule, with the seed of the folder."""
+        return self.settings.draw(name, shape, kind)
+
+
+Group = Callable[[Context], Iterator[Check]]
+
+
+@dataclasses.dataclass(frozen=True)
+class PackChecks:
+    """How the entries of one kind of pack are computed.
+
+    Attributes:
+      name: what --only selects.
+      files: names of the files, regular expressions that match the whole name.
+      groups: each yields checks of some entries; one that raises does not stop the others.
+      left_out: entry (regular expression, whole name) -> why it is not checked.
+      needs_recordings: whether the groups run only where recordings are given; else all is left out, and said.
+    """
+
+    name: str
+    files: tuple[str, ...]
+    groups: tuple[Group, ...]
+    left_out: Mapping[str, str] = dataclasses.field(default_factory=dict)
+    needs_recordings: bool = False
+
+    def reads(self, file: str) -> bool:
+        return any(re.fullmatch(pattern, file) for pattern in self.files)
+
+    def reason(self, entry: str) -> str | None:
+        """Why an entry is not checked, None where it ought to be."""
+        return next((why for pattern, why in self.left_out.items() if re.fullmatch(pattern, entry)), None)

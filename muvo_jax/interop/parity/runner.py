@@ -1,0 +1,136 @@
+"""Runs the checks of a folder of packs and counts what passed, failed and was left out."""
+
+from __future__ import annotations
+
+import collections
+import dataclasses
+import math
+import pathlib
+from collections.abc import Callable, Iterable, Sequence
+
+from muvo_jax.interop import packs
+from muvo_jax.interop.parity import cases
+
+Print = Callable[[str], None]
+RECORDINGS_REASON = "needs recordings: give their folder with --recordings=PATH"
+SUBFOLDERS = (".", "p4_full")
+
+
+@dataclasses.dataclass
+class Report:
+    """The outcome of a folder.
+
+    Attributes:
+      passed, failed: how many entries.
+      left_out: reason -> how many entries.
+      unexplained: entries that were neither checked nor left out for a stated reason, and files that no check reads.
+    """
+
+    passed: int = 0
+    failed: int = 0
+    left_out: collections.Counter = dataclasses.field(default_factory=collections.Counter)
+    unexplained: list[str] = dataclasses.field(default_factory=list)
+
+    @property
+    def ok(self) -> bool:
+        return self.passed > 0 and not self.failed and not self.unexplained
+
+    def lines(self) -> list[str]:
+        """The summary, a line each."""
+        checked = self.passed + self.failed
+        out = [f"{checked} entries checked: {self.passed} passed, {self.failed} failed; "
+               f"{sum(self.left_out.values()) + len(self.unexplained)} left out"]
+        out += [f"left out, {count}: {reason}" for reason, count in self.left_out.items()]
+        return out + [f"left out WITHOUT A REASON: {name}" for name in self.unexplained]
+
+
+def run_folder(folder: pathlib.Path, registry: Sequence[cases.PackChecks], *, only: Iterable[str] = (),
+               recordings: pathlib.Path | None = None, write: Print = print) -> Report:
+    """Checks every pack in a folder, and in its subfolder p4_full.
+
+    Args:
+      folder: holds npz files and pack.json; a folder with packs of recordings alone needs no pack.json.
+      registry: all packs that can be checked.
+      only: names of packs or their beginnings ("p3" stands for p3_1d and p3_2d); none means all.
+      recordings: folder of recordings, for the packs that need some.
+      write: gets one line for each entry.
+
+    Raises:
+      packs.PackError: where the folder holds no pack, or a file is unreadable.
+      ValueError: for an unknown name in `only`.
+    """
+    chosen = _chosen(registry, tuple(only))
+    report, tasks = Report(), []
+    for path in _files(folder):
+        checks = next((checks for checks in registry if checks.reads(path.name)), None)
+        if checks is None and not only:
+            report.unexplained.append(f"{path.name}: no check reads this file")
+        elif checks in chosen:
+            tasks.append((checks, path))
+    tasks.sort(key=lambda task: registry.index(task[0]))
+    if not tasks:
+        raise packs.PackError(f"{folder}: expected packs such as p1_losses_metrics.npz, found none"
+                              f"{' of ' + ', '.join(only) if only else ''}.")
+    optional = all(checks.needs_recordings for checks, _ in tasks)
+    settings = packs.Settings(None if optional and not (folder / "pack.json").exists() else folder)
+    for checks, path in tasks:
+        run_pack(checks, cases.Context(packs.Pack(path), settings, recordings), report, write)
+    return report
+
+
+def run_pack(checks: cases.PackChecks, context: cases.Context, report: Report, write: Print) -> None:
+    """Checks the entries of one file, adding to `report`."""
+    done: set[str] = set()
+    label = context.pack.path.stem
+    skipped = checks.needs_recordings and context.recordings is None
+    problems = []
+    for group in () if skipped else checks.groups:
+        try:
+            for check in group(context):
+                if check.entry in context.pack and check.entry not in done:
+                    done.add(check.entry)
+                    _record(check, context.pack, label, report, write)
+        except Exception as error:  # one group must not hide the others; its entries are then left out, which fails
+            problems.append(f"{label}: {_name(group)} stopped with {type(error).__name__}: {_first_line(error)}")
+    for entry in context.pack.names:
+        if entry not in done:
+            reason = RECORDINGS_REASON if skipped else checks.reason(entry)
+            if reason is None:
+                report.unexplained.append(f"{label} {entry}")
+            else:
+                report.left_out[f"{label}: {reason}"] += 1
+    report.unexplained += problems
+
+
+def _record(check: cases.Check, pack: packs.Pack, label: str, report: Report, write: Print) -> None:
+    try:
+        error, note = check.measure(pack, check.entry, check.got), ""
+    except ValueError as wrong_shape:
+        error, note = math.inf, f"  ({wrong_shape})"
+    passed = error <= check.tolerance
+    report.passed += passed
+    report.failed += not passed
+    write(f"{label:28s} {check.entry:44s} error {error:8.1e}  tolerance {check.tolerance:7.0e}  "
+          f"{'pass' if passed else 'FAIL'}{note}")
+
+
+def _files(folder: pathlib.Path) -> list[pathlib.Path]:
+    if not folder.is_dir():
+        raise packs.PackError(f"{folder}: expected a folder of packs, found {'a file' if folder.exists() else 'none'}.")
+    return sorted(path for name in SUBFOLDERS for path in (folder / name).glob("*.npz"))
+
+
+def _chosen(registry: Sequence[cases.PackChecks], only: tuple[str, ...]) -> list[cases.PackChecks]:
+    unknown = [name for name in only if not any(checks.name.startswith(name) for checks in registry)]
+    if unknown:
+        raise ValueError(f"--only={','.join(unknown)}: expected some of "
+                         f"{', '.join(checks.name for checks in registry)}.")
+    return [checks for checks in registry if not only or checks.name.startswith(only)]
+
+
+def _name(group: cases.Group) -> str:
+    return getattr(group, "__name__", str(group))
+
+
+def _first_line(error: Exception) -> str:
+    return (str(error).splitlines() or [""])[0]

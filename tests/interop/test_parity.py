@@ -1,0 +1,148 @@
+"""The parity check: its rule, its reader, what it accepts and refuses, and the packs that lie in tests/golden."""
+
+import dataclasses
+import json
+import zlib
+
+import golden_rule
+import numpy as np
+import pytest
+
+from muvo_jax.interop import packs, weights_rule
+from muvo_jax.interop.parity import cases, losses, modules_1d, registry, runner
+
+SILENT = lambda line: None
+# CRC-32 of arrays that the rule must give on every machine.
+WEIGHTS = {("rssm.prior.module.0.weight", (64, 64)): 107853824, ("a.bn1.weight", (16,)): 2935760857,
+           ("a.bn1.bias", (16,)): 3539044924, ("a.bn1.running_var", (16,)): 2782270229,
+           ("rgb_decoder.trans_conv1.0.weight", (8, 4, 6, 6)): 452346914, ("type_embedding", (1, 1, 8, 2)): 3970937600}
+INPUTS = {("normal", (5, 7)): 2250587215, ("smooth", (2, 20, 30)): 1229600280, ("image_u8", (3, 20, 30)): 3182604029,
+          ("route_u8", (3, 16, 16)): 2135944411, ("range_view", (4, 8, 32)): 2890411049,
+          ("voxel2", (16, 16, 8)): 1804015266, ("voxel9_ign", (16, 16, 8)): 510834341,
+          ("labels8", (12, 12)): 475118475, ("cloud", (200,)): 1815993543, ("depth_m", (20, 30)): 770451330,
+          ("mask", (12, 12)): 39174248, ("sigma", (4,)): 878203011}
+
+
+def checksum(array):
+    return zlib.crc32(np.ascontiguousarray(array).tobytes())
+
+
+def test_the_rule_draws_the_same_numbers_everywhere():
+    assert {case: checksum(weights_rule.make_param(*case)) for case in WEIGHTS} == WEIGHTS
+    assert {case: checksum(weights_rule.make_input("selftest", case[1], case[0], 3)) for case in INPUTS} == INPUTS
+
+
+def test_rule_refuses_what_it_does_not_draw():
+    with pytest.raises(ValueError, match="computed by the model"):
+        weights_rule.make_param("frustum_pooling.bev_intrinsics", (3, 3))
+    with pytest.raises(ValueError, match="kind 'blue'"):
+        weights_rule.make_input("x", (3,), "blue")
+
+
+def test_error_of_a_subsampled_entry_sees_what_was_not_stored(tmp_path):
+    values = np.arange(12, dtype=np.float32).reshape(3, 4)
+    np.savez(tmp_path / "p.npz", **{
+        "whole": values, "part::sub": values.reshape(-1)[::5], "part::meta": np.array([5, 3, 4]),
+        "part::stats": np.array([values.mean(), values.std(), 0, 11, np.sqrt((values ** 2).sum())])})
+    pack = packs.Pack(tmp_path / "p.npz")
+    assert pack.names == ["part", "whole"] and pack.shape("part") == (3, 4)
+    assert pack.error("whole", values + 1.1) == pytest.approx(0.1)
+    assert pack.error("part", values) < 1e-6
+    unseen = values.copy()
+    unseen[2, 3] = 0.0  # flat index 11, which the stride of 5 skips
+    assert pack.error("part", unseen) > 0.05
+    with pytest.raises(ValueError, match=r"got shape \[4, 3\], expected \[3, 4\]"):
+        pack.error("whole", values.T)
+
+
+def write_folder(folder, entries, **settings):
+    """A folder of packs as the command takes it."""
+    (folder / "pack.json").write_text(json.dumps({"format": 1, **settings}))
+    np.savez(folder / "p1_losses_metrics.npz", **entries)
+    return folder
+
+
+def other_pack():
+    """Entries of other seed and sizes, from float64 NumPy: means of absolute and squared errors, KL's value."""
+    draw = lambda *case: weights_rule.make_input(*case, 5).astype(np.float64)
+    error = draw("act_pred", (3, 4, 1), "pm1") - draw("act_tgt", (3, 4, 1), "pm1")
+    plane = draw("sp_pred", (2, 2, 3, 10, 14), "normal") - draw("sp_tgt", (2, 2, 3, 10, 14), "normal")
+    mask = weights_rule.make_input("sp_imask", (2, 2, 1, 10, 14), "mask", 5)
+    shape = (1, 5, 6)
+    moments = {f"{side}_{moment}": draw(f"kl_1d_{side}_{moment}", shape, kind) for side in ("prior", "posterior")
+               for moment, kind in (("mu", "normal"), ("sigma", "sigma"))}
+    prior_mean = np.concatenate([np.zeros((1, 1, 6)), moments["prior_mu"][:, 1:]], 1)
+    prior_std = np.concatenate([np.ones((1, 1, 6)), moments["prior_sigma"][:, 1:]], 1)
+    std = moments["posterior_sigma"][:, [1, 1, 2, 3, 4]]
+    divergence = (np.log(prior_std / std) - 0.5
+                  + (std ** 2 + (moments["posterior_mu"] - prior_mean) ** 2) / (2 * prior_std ** 2))
+    return {"regression_l1/loss": np.abs(error).sum(-1).mean(), "regression_l1/grad": np.sign(error) / 12,
+            "regression_l2/grad": 2 * error / 12, "spatial_l1/loss": np.abs(plane).sum(2).mean(),
+            "spatial_l2_imask/loss": (plane ** 2 * mask).sum() / mask.sum(),
+            "kl0.75_1d/loss": divergence.sum(-1).mean()}
+
+
+def test_packs_of_another_seed_and_other_sizes(tmp_path):
+    sizes = {"p1": {"regression": [3, 4, 1], "spatial_hw": [10, 14], "kl_1d": [1, 5, 6]}}
+    entries = other_pack()
+    report = runner.run_folder(write_folder(tmp_path, entries, seed=5, **sizes), registry.PACKS, only=["p1"],
+                               write=SILENT)
+    assert (report.passed, report.failed, report.unexplained) == (len(entries), 0, []) and report.ok
+
+
+def test_a_wrong_number_and_an_unknown_entry_fail(tmp_path):
+    entries = {"regression_l1/loss": np.float32(0.3), "hyperbolic/loss": np.float32(0.0)}
+    lines = []
+    report = runner.run_folder(write_folder(tmp_path, entries, seed=0), registry.PACKS, write=lines.append)
+    assert report.failed == 1 and not report.ok and "FAIL" in lines[0]
+    assert report.unexplained == ["p1_losses_metrics hyperbolic/loss"]
+    assert any("hyperbolic/loss" in line for line in report.lines())
+
+
+def test_what_cannot_be_checked_is_said(tmp_path):
+    with pytest.raises(packs.PackError, match="found none"):
+        runner.run_folder(tmp_path, registry.PACKS, write=SILENT)
+    np.savez(tmp_path / "p1_losses_metrics.npz", x=np.zeros(2))
+    with pytest.raises(packs.PackError, match=r"pack\.json: expected the JSON description"):
+        runner.run_folder(tmp_path, registry.PACKS, write=SILENT)
+    write_folder(tmp_path, {"x": np.array([object()])}, seed=0)
+    with pytest.raises(packs.PackError, match=r"p1_losses_metrics\.npz: expected an npz file of plain arrays"):
+        runner.run_folder(tmp_path, registry.PACKS, write=SILENT)
+    (tmp_path / "pack.json").write_text(json.dumps({"format": 9}))
+    with pytest.raises(packs.PackError, match="expected format 1, found 9"):
+        runner.run_folder(tmp_path, registry.PACKS, write=SILENT)
+    with pytest.raises(ValueError, match="--only=q1"):
+        runner.run_folder(tmp_path, registry.PACKS, only=["q1"], write=SILENT)
+
+
+def test_recordings_are_asked_for(tmp_path):
+    np.savez(tmp_path / "p6_dataset.npz", x=np.zeros(2))
+    report = runner.run_folder(tmp_path, registry.PACKS, write=SILENT)  # needs no pack.json
+    assert not report.unexplained and runner.RECORDINGS_REASON in next(iter(report.left_out))
+
+
+def checked(name, file, groups):
+    """The report of some groups of a pack in tests/golden; what other groups check counts as unexplained."""
+    checks = next(checks for checks in registry.PACKS if checks.name == name)
+    report, lines = runner.Report(), []
+    pack = packs.Pack(golden_rule.FOLDER / file)
+    context = cases.Context(pack, packs.Settings(golden_rule.FOLDER))
+    runner.run_pack(dataclasses.replace(checks, groups=groups), context, report, lines.append)
+    assert not report.failed, "\n".join(lines)
+    return report
+
+
+def test_losses():
+    assert checked("p1", "p1_losses_metrics.npz", losses.GROUPS).passed > 60
+
+
+def test_modules_of_the_1d_model():
+    groups = (modules_1d.compression, modules_1d.recurrent)
+    assert checked("p3_1d", "p3_modules_1d.npz", groups).passed == 30
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name, file", [("p3_1d", "p3_modules_1d.npz")])
+def test_whole_packs(name, file):
+    checks = next(checks for checks in registry.PACKS if checks.name == name)
+    assert checked(name, file, checks.groups).ok

@@ -83,6 +83,7 @@ class ModelConfig:
       backbone_width: channels of the first ResNet-18 level (the others are 2, 4 and 8 times as wide).
       token_channels, transformer_*: the fusion transformer.
       fused_channels: channels of each sensor's pooled vector after fusion.
+      keep_cells: fusion hands on every cell of the compressed maps instead of their mean.
       embedding_channels: size of the observation embedding.
       deterministic_channels, stochastic_channels, action_channels: the recurrent state-space model of the 1D latent.
       transition_layers: of the transformers that are prior and posterior of the 2D latent, whose tokens have
@@ -119,6 +120,7 @@ class ModelConfig:
     transformer_hidden_channels: int = 2048
     dropout: float = 0.1
     fused_channels: int = 512
+    keep_cells: bool = False
     measurement_channels: int = 16
     embedding_channels: int = 512
     deterministic_channels: int = 1024

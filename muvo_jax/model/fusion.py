@@ -12,16 +12,21 @@ from muvo_jax.nn import attention, layers, norm, resnet
 
 
 class Compression(linen.Module):
-    """[N, H, W, C] -> [N, features]: a halving block, a block, the mean over the map."""
+    """[N, H, W, C] -> [N, features]: a halving block, a block, the mean over the map.
+
+    Or all of its cells side by side, [N, H/2 * W/2 * features]: in a small preset the map has a handful of cells, and
+    their mean no longer says what stands left and what right.
+    """
 
     features: int
+    keep_cells: bool = False
     compute: layers.Compute = layers.Compute()
 
     @linen.compact
     def __call__(self, x: jax.Array, mode: norm.Mode) -> jax.Array:
         x = resnet.BasicBlock(self.features, self.compute, stride=2, project=True, name="block0")(x, mode)
         x = resnet.BasicBlock(self.features, self.compute, name="block1")(x, mode)
-        return jnp.mean(x, axis=(1, 2))
+        return x.reshape(x.shape[0], -1) if self.keep_cells else jnp.mean(x, axis=(1, 2))
 
 
 class TransformerFusion(linen.Module):
@@ -53,12 +58,20 @@ class TransformerFusion(linen.Module):
             compute, name="transformer")(jnp.concatenate(tokens, axis=1), keys)
         if config.latent == "2d":
             return mixed.astype(jnp.float32)
-        image_vector = Compression(config.fused_channels, compute, name="image_compression")(
+        image_vector = Compression(config.fused_channels, config.keep_cells, compute, name="image_compression")(
             mixed[:, :image_count].reshape(image_map.shape), mode)
-        lidar_vector = Compression(config.fused_channels, compute, name="lidar_compression")(
+        lidar_vector = Compression(config.fused_channels, config.keep_cells, compute, name="lidar_compression")(
             mixed[:, image_count:].reshape(lidar_map.shape), mode)
         joined = jnp.concatenate([image_vector, lidar_vector, *measurements], axis=-1)
         return layers.Dense(config.embedding_channels, compute, name="combine")(joined).astype(jnp.float32)
 
 
 REGISTRY = {"tr": TransformerFusion}
+
+
+def initial_constants(config: ModelConfig) -> dict[str, float]:
+    """Path of a parameter -> its first value: a fresh fusion transformer hands its tokens through unmixed."""
+    if config.fusion != "tr":
+        return {}
+    return {f"fusion/transformer/layer{index}/{layer}/kernel": 0.0
+            for index in range(config.transformer_layers) for layer in ("self_attn/out_proj", "linear2")}

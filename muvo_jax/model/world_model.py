@@ -125,7 +125,8 @@ class WorldModel:
         """
         if batch is not None:
             self._frames(batch)
-        constants = {**heads.initial_constants(self.config), **transition.initial_constants(self.config)}
+        constants = {**heads.initial_constants(self.config), **transition.initial_constants(self.config),
+                     **fusion.initial_constants(self.config)}
         return init_lib.fill(self.variable_shapes(), key, constants)
 
     def encode(self, variables: Variables, batch: Batch, *, train: bool = False, keys: jax.Array | None = None,

@@ -184,3 +184,22 @@ def world_model_setting():
 @functools.cache
 def world_model_gradients_of_one_device():
     return gradients_under("single", *world_model_setting())
+
+
+def test_some_frames_of_each_window_are_decoded_and_others_in_the_next_step():
+    _, config, batch, _ = setting(heads=FEW)
+    features = np.arange(small_world.WINDOWS * 3, dtype=np.float32).reshape(small_world.WINDOWS, 3, 1)
+    draws = []
+    for step in (0, 0, 1):
+        keys = step_lib.sample_keys(jax.random.key(1), step, 0, small_world.WINDOWS, None)
+        picked, some = step_lib._decoded_frames(features, batch, keys, 2)
+        frames = np.asarray(picked[..., 0], np.int64) - 3 * np.arange(small_world.WINDOWS)[:, None]
+        assert frames.shape == (small_world.WINDOWS, 2) and (frames[:, 0] != frames[:, 1]).all()
+        for window, chosen in enumerate(frames):
+            np.testing.assert_array_equal(some.action[window], batch.action[window, chosen])
+            np.testing.assert_array_equal(some.image[window], batch.image[window, chosen])
+        draws.append(frames)
+    np.testing.assert_array_equal(draws[0], draws[1])
+    assert (draws[0] != draws[2]).any()
+    everything, same = step_lib._decoded_frames(features, batch, keys, 0)
+    assert everything is features and same is batch

@@ -117,8 +117,8 @@ class Batch(_Indexable):
 _BATCH_FIELDS = {
     "action": (np.float32, 3), "is_first": (np.bool_, 2), "image": (np.uint8, 5), "range_view": (np.float32, 5),
     "points": (np.float32, 4), "point_count": (np.int32, 2), "command": (np.int32, 2), "next_command": (np.int32, 2),
-    "target_m": (np.float32, 3), "next_target_m": (np.float32, 3), "occupancy": (np.uint8, 5), "route_map": (np.uint8, 4),
-    "speed_mps": (np.float32, 2), "reward": (np.float32, 2),
+    "target_m": (np.float32, 3), "next_target_m": (np.float32, 3), "occupancy": (np.uint8, 5),
+    "route_map": (np.uint8, 4), "speed_mps": (np.float32, 2), "reward": (np.float32, 2),
     "is_terminal": (np.bool_, 2), "intrinsics": (np.float32, 3), "camera_to_ego": (np.float32, 3),
 }
 

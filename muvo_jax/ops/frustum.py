@@ -39,8 +39,8 @@ def frustum_points(intrinsics: jax.Array, camera_to_ego: jax.Array, map_size: tu
     else:
         v_px, u_px = (stride * (jnp.arange(side, dtype=jnp.float32) + 0.5) for side in map_size)
     depth_m = jnp.arange(1, bins + 1, dtype=jnp.float32)
-    ones = jnp.ones((rows, columns), jnp.float32)
-    pixels = jnp.stack([jnp.broadcast_to(u_px[None], ones.shape), jnp.broadcast_to(v_px[:, None], ones.shape), ones], -1)
+    v_px, u_px = jnp.meshgrid(v_px, u_px, indexing="ij")
+    pixels = jnp.stack([u_px, v_px, jnp.ones_like(u_px)], axis=-1)
     scaled = jnp.expand_dims(pixels, 0) * depth_m[:, None, None, None]
     to_ego = jnp.einsum("bij,bjk->bik", camera_to_ego[:, :3, :3], jnp.linalg.inv(intrinsics),
                         precision=jax.lax.Precision.HIGHEST)
@@ -82,7 +82,7 @@ def pool(values: jax.Array, cells: jax.Array, grid: BirdsEyeGrid) -> jax.Array:
 
 
 def most_probable(probabilities: jax.Array, cells: jax.Array, count: int) -> tuple[jax.Array, jax.Array]:
-    """The `count` largest probabilities [B, D, P] over D and the cells [B, D, P] that they go to: [B, count, P] each."""
+    """The `count` largest probabilities [B, D, P] over D, and the cells that they go to: [B, count, P] each."""
     if count == probabilities.shape[1]:
         return probabilities, cells
     chosen, index = jax.lax.top_k(jnp.moveaxis(probabilities, 1, -1), count)

@@ -41,7 +41,7 @@ def pillar_indices(points_m: jax.Array, count: jax.Array, grid: PillarGrid) -> t
 
 def decorate(points_m: jax.Array, index: jax.Array, cell: jax.Array, grid: PillarGrid, *,
              swapped_corners: bool = False) -> jax.Array:
-    """What the network sees of each point: x, y, z; the same minus the mean of its pillar; x, y minus its cell's centre.
+    """What the network sees of a point: x, y, z; the same minus the pillar's mean; x, y minus the cell's centre.
 
     Args:
       points_m, index, cell: of `pillar_indices`.

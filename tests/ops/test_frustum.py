@@ -19,7 +19,7 @@ PACK = "p2_geometry.npz"
 @functools.cache
 def case(tag, sparse):
     """The reference's inputs: values [B, P, C] on the rays, their cells, and the weights of the gradient."""
-    rows, columns, channels, stride = SIZES[tag]
+    rows, columns, channels, _ = SIZES[tag]
     shape = (2, 1, GRID.depth_bins, rows, columns, channels)
     values = make_input(f"fp_{tag}_x", shape, "normal")[:, 0]
     logits = 2 * make_input(f"fp_{tag}_logit", shape[:1] + shape[2:5], "normal")

@@ -1,4 +1,4 @@
-"""Which pillar a point is in and what is made of it, in worked arithmetic; the reference's numbers are in tests/model."""
+"""Which pillar a point is in and what is made of it, in worked arithmetic."""
 
 import functools
 

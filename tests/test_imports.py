@@ -17,7 +17,7 @@ ALLOWED = {
     "geometry": set(),
     "config": {"config_json", "geometry"},
     "presets": {"config"},
-    "ops": {"types", "config"},
+    "ops": {"types", "config", "geometry"},
     "nn": BASE,
     "model": BASE | {"nn"},
     "objectives": BASE | {"nn", "model"},

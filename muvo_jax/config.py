@@ -181,11 +181,13 @@ class ModelConfig:
 class LossConfig:
     """Weights of the loss terms (paper Eq. 1) at scale 1; scale f counts 1/f.
 
-    `image`, `range_xyz`, `range_depth` and `occupancy_*` apply per scale; 0 switches a term off. The Chamfer term looks
-    at `chamfer_points` returns of each side; a predicted return is a predicted range above `return_threshold_m`.
+    `image` (L1), `image_squared` (L2, an addition to the paper), `range_xyz`, `range_depth` and `occupancy_*` apply per
+    scale; 0 switches a term off. The Chamfer term looks at `chamfer_points` returns of each side; a predicted return is
+    a predicted range above `return_threshold_m`.
     """
 
     image: float = 0.1
+    image_squared: float = 0.0
     range_xyz: float = 0.1
     range_depth: float = 0.1
     occupancy_cross_entropy: float = 0.1
@@ -262,6 +264,8 @@ class TrainConfig:
       validation_windows: windows of each split looked at during training (evaluate uses all of them).
       keep_last, keep_best: how many checkpoints stay.
       decode_frames: how many frames of a window are decoded in a training step, drawn anew each time; 0 means all.
+      observe_frames: so many frames of a training window are observed, the rest imagined from the last of them; 0
+        observes all.
       parallel: "auto" uses shard_map over all devices where there is more than one.
     """
 
@@ -278,6 +282,7 @@ class TrainConfig:
     parallel: Literal["auto", "pmap", "shard_map"] = "auto"
     remat: bool = False
     decode_frames: int = 0
+    observe_frames: int = 0
 
 
 @dataclasses.dataclass(frozen=True)

@@ -26,7 +26,7 @@ from muvo_jax.training import parallel as parallel_lib
 from muvo_jax.training import state as state_lib
 
 Metrics = dict[str, types.Array]
-_DECODE_SITE = 0xDEC0  # separates this draw from all others made with the same sample key
+_DECODE_SITE, _IMAGINE_SITE = 0xDEC0, 0x1A61  # separate these draws from all others made with the same sample key
 _VALIDATION_STEP = 2**31 - 1  # folded into the key where training folds its step in; no run gets there
 
 
@@ -164,7 +164,7 @@ def sample_keys(run_key: types.Array, step: int | types.Array, micro_batch: int 
 
 def forward(params: Any, batch_stats: Any, batch: types.Batch, keys: types.Array, *, model: world_model.WorldModel,
             config: config_lib.Config, train: bool, axis_name: str | None) -> tuple[types.Array, tuple[Metrics, Any]]:
-    """Observes a window, decodes every frame and scores it.
+    """Observes a window, decodes its frames (in training those that the config asks for) and scores them.
 
     Args:
       params, batch_stats: the model's variables.
@@ -179,9 +179,13 @@ def forward(params: Any, batch_stats: Any, batch: types.Batch, keys: types.Array
     """
     maybe_remat = jax.checkpoint if config.train.remat else lambda function: function
     variables = {"params": params, "batch_stats": batch_stats}
+    seen = min(config.train.observe_frames or batch.frames, batch.frames) if train else batch.frames
     observe = functools.partial(rollout.observe_window, model, train=train, axis_name=axis_name)
-    observed, batch_stats = maybe_remat(observe)(variables, batch, keys)
-    features, batch = _decoded_frames(observed.states.features, batch, keys, config.train.decode_frames if train else 0)
+    observed, batch_stats = maybe_remat(observe)(variables, batch.time_slice(0, seen), keys)
+    features = observed.states.features
+    if train:
+        features = _and_imagined(model, variables, observed, batch.action, keys)
+        features, batch = _some_frames(features, batch, keys, config.train.decode_frames)
     predictions: types.Predictions = {}
     for head in model.config.heads:
         decode = functools.partial(model.decode, heads=(head,))
@@ -194,13 +198,27 @@ def forward(params: Any, batch_stats: Any, batch: types.Batch, keys: types.Array
     return terms["total"], (metrics, batch_stats)
 
 
-def _decoded_frames(features: types.Array, batch: types.Batch, keys: types.Array,
-                    count: int) -> tuple[types.Array, types.Batch]:
-    """Of each window the `count` frames that are decoded, drawn anew in every step; 0 or T takes all of them.
+def _and_imagined(model: world_model.WorldModel, variables: types.Variables, observed: types.Observed,
+                  action: types.ArrayLike, keys: types.Array) -> types.Array:
+    """Features of all frames of a window: the observed ones, then those that follow from the last one's state.
+
+    The loss of a decoded frame then also teaches prediction over several steps, beside the KL divergence over one.
+    """
+    seen = observed.states.deterministic.shape[1]
+    if seen == action.shape[1]:
+        return observed.states.features
+    dream_keys = jax.vmap(jax.random.fold_in, (0, None))(keys, _IMAGINE_SITE)
+    dream = rollout.imagine(model, variables, dream_keys, observed.last, action[:, seen - 1:-1])
+    return jnp.concatenate([observed.states.features, dream.features], axis=1)
+
+
+def _some_frames(features: types.Array, batch: types.Batch, keys: types.Array,
+                 count: int) -> tuple[types.Array, types.Batch]:
+    """Of each window the `count` frames that are decoded, drawn anew in every step; 0 or T and more take all of them.
 
     Neighbouring frames look alike: decoding a few of more windows teaches more at the same cost.
     """
-    if count in (0, batch.frames):
+    if count == 0 or count >= batch.frames:
         return features, batch
     draw = lambda key: jax.random.permutation(jax.random.fold_in(key, _DECODE_SITE), batch.frames)[:count]
     chosen = jax.vmap(draw)(keys)

@@ -45,13 +45,13 @@ def town() -> config_lib.Config:
     return config_lib.Config(
         preset="town",
         model=model,
-        loss=config_lib.LossConfig(image=1.0, image_squared=4.0, range_xyz=10.0, range_depth=2.0, chamfer=4.0,
+        loss=config_lib.LossConfig(image=1.5, image_squared=8.0, range_xyz=10.0, range_depth=2.0, chamfer=4.0,
                                    occupancy_cross_entropy=2.0, occupancy_semantic_scal=0.05,
                                    occupancy_geometric_scal=0.05, action=0.2, kl=5e-4),
         optimizer=config_lib.OptimizerConfig(learning_rate=2e-3, warmup_fraction=0.1, clip_norm=10.0),
         data=config_lib.DataConfig(frames=8),
-        train=config_lib.TrainConfig(steps=480, batch=12, decode_frames=1, observe_frames=3, validate_every=240,
-                                     checkpoint_every=240, preview_every=480, validation_windows=8),
+        train=config_lib.TrainConfig(steps=560, batch=12, decode_frames=1, observe_frames=3, validate_every=280,
+                                     checkpoint_every=280, preview_every=560, validation_windows=8),
         evaluation=config_lib.EvaluationConfig(windows=32),
     )
 

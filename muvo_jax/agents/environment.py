@@ -71,12 +71,15 @@ class EnvState:
       motion: the car in the ego frame of the start.
       start: int32, index into the bank.
       time: int32, steps since the start.
+      reward, terminated: float32 and bool, of the step that led here; 0 and false at the start.
     """
 
     latent: LatentState
     motion: kinematics.Motion
     start: Array
     time: Array
+    reward: Array
+    terminated: Array
 
 
 @flax.struct.dataclass
@@ -172,7 +175,7 @@ class Environment:
         """Draws a start from the bank: (observation, state)."""
         start = jax.random.randint(key, (), 0, params.bank.size)
         state = EnvState(params.bank.latent[start], kinematics.at_rest_of_frame(params.bank.speed_mps[start]),
-                         start, jnp.int32(0))
+                         start, jnp.int32(0), jnp.float32(0), jnp.bool_(False))
         return self.observe(state, params), state
 
     def observe(self, state: EnvState, params: EnvParams) -> Any:
@@ -195,7 +198,7 @@ class Environment:
         route_map = None if params.bank.route_map is None else params.bank.route_map[state.start]
         moment = rewards.Moment(state.motion, motion, action, latent.features, for_reward, route_map)
         reward, terminated, terms = self._reward(moment)
-        after = EnvState(latent, motion, state.start, state.time + 1)
+        after = EnvState(latent, motion, state.start, state.time + 1, reward, terminated)
         truncated = after.time >= params.max_steps_in_episode
         return after, Transition(self._observe(latent.features, full), reward, terminated, truncated, terms)
 

@@ -1,8 +1,8 @@
 """Where imagined actions take the car: the kinematic bicycle of the action contract, in JAX.
 
-The same equations as the town's simulator: a period of dt seconds changes the speed to v' = max(0, v + pedal dt), drives
-the distance d = (v + v') dt / 2, turns by -d tan(steering * steer_full) / wheelbase (steering > 0 is right), and moves
-along the mean of old and new heading.
+The same equations as the town's simulator: a period of dt seconds changes the speed to v' = max(0, v + pedal dt),
+drives the distance d = (v + v') dt / 2, turns by -d tan(steering * steer_full) / wheelbase (steering > 0 is right), and
+moves along the mean of old and new heading.
 """
 
 from __future__ import annotations

@@ -59,7 +59,7 @@ class RewardConfig:
     collision: float = 5.0
     comfort: float = 0.05
     speeding: float = 0.5
-    terminal_collision: float = 0.7
+    terminal_collision: float = 0.5
     route_tolerance_m: float = 2.0
     speed_limit_mps: float = 10.0
     comfortable_mps2: float = 3.0

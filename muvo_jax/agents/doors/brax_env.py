@@ -8,16 +8,19 @@ compiles.
 
 from __future__ import annotations
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 
 from muvo_jax.agents import environment as environment_lib
 from muvo_jax.agents.doors import optional
 
-brax_base = optional.need("brax.envs.base", "brax")
+_base: Any = optional.need("brax.envs.base", "brax")
+Base: Any = _base.Env
 
 
-class BraxImagination(brax_base.Env):
+class BraxImagination(Base):
     """The core as a brax Env; observations must be one vector (observation="features")."""
 
     def __init__(self, core: environment_lib.Environment, params: environment_lib.EnvParams):
@@ -27,15 +30,15 @@ class BraxImagination(brax_base.Env):
         self.core = core
         self._params = params
 
-    def reset(self, rng: jax.Array) -> brax_base.State:
+    def reset(self, rng: jax.Array) -> Any:
         key, key_start = jax.random.split(_typed(rng))
         observation, state = self.core.reset(key_start, self._params)
         metrics = jax.eval_shape(lambda: self.core.step(key, state, jnp.zeros(2), self._params)[1].terms)
         zeros = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), metrics)
         info = {"key": jax.random.key_data(key), "truncation": jnp.float32(0)}
-        return brax_base.State(state, observation, jnp.float32(0), jnp.float32(0), zeros, info)
+        return _base.State(state, observation, jnp.float32(0), jnp.float32(0), zeros, info)
 
-    def step(self, state: brax_base.State, action: jax.Array) -> brax_base.State:
+    def step(self, state: Any, action: jax.Array) -> Any:
         key, key_step = jax.random.split(_typed(state.info["key"]))
         after, transition = self.core.step(key_step, state.pipeline_state, action, self._params)
         truncation = (transition.truncated & ~transition.terminated).astype(jnp.float32)

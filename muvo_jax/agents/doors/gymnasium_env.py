@@ -11,11 +11,12 @@ import numpy as np
 from muvo_jax.agents import environment as environment_lib
 from muvo_jax.agents.doors import optional
 
-gymnasium = optional.need("gymnasium", "gymnasium")
-functional = optional.need("gymnasium.experimental.functional", "gymnasium")
+gymnasium: Any = optional.need("gymnasium", "gymnasium")
+Functional: Any = optional.need("gymnasium.experimental.functional", "gymnasium").FuncEnv
+Env: Any = gymnasium.Env
 
 
-class FunctionalImagination(functional.FuncEnv):
+class FunctionalImagination(Functional):
     """The core as a FuncEnv. A FuncEnv has no truncation: FunctionalJaxEnv(...) needs a TimeLimit of the horizon.
 
     Keys may be raw or typed. Gymnasium's wrapper gives one key to transition and observation alike; the observation
@@ -50,7 +51,7 @@ class FunctionalImagination(functional.FuncEnv):
         return self.default_params if params is None else params
 
 
-class GymnasiumImagination(gymnasium.Env):
+class GymnasiumImagination(Env):
     """The core as a gymnasium.Env: NumPy in and out, one compiled step. Truncated at the horizon; does not restart."""
 
     metadata: dict[str, Any] = {"render_modes": []}  # noqa: RUF012 (gymnasium's own form)

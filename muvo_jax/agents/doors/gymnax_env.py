@@ -10,11 +10,11 @@ import jax.numpy as jnp
 from muvo_jax.agents import environment as environment_lib
 from muvo_jax.agents.doors import optional
 
-gymnax_environment = optional.need("gymnax.environments.environment", "gymnax")
-gymnax_spaces = optional.need("gymnax.environments.spaces", "gymnax")
+Base: Any = optional.need("gymnax.environments.environment", "gymnax").Environment
+gymnax_spaces: Any = optional.need("gymnax.environments.spaces", "gymnax")
 
 
-class GymnaxImagination(gymnax_environment.Environment):
+class GymnaxImagination(Base):
     """The core under gymnax's names; the weights and start states are its params (pass them, or they are constants).
 
     `with_transition_gradients()` lets gradients through.

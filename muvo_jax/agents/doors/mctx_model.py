@@ -20,7 +20,7 @@ from muvo_jax.agents import environment as environment_lib
 from muvo_jax.agents.doors import optional
 from muvo_jax.types import Array
 
-mctx = optional.need("mctx", "mctx")
+mctx: Any = optional.need("mctx", "mctx")
 
 # (agent parameters, observation [F]) -> (prior logits [K], value []) for a grid;
 # (agent parameters, key, observation [F]) -> (candidates [K, 2], prior logits [K], value []) for sampled candidates.
@@ -64,13 +64,13 @@ class MctxModel:
     prior: CandidatePrior
     discount: float = 0.99
 
-    def root(self, params: SearchParams, rng_key: Array, state: environment_lib.EnvState) -> mctx.RootFnOutput:
+    def root(self, params: SearchParams, rng_key: Array, state: environment_lib.EnvState) -> Any:
         """The root over EnvStates [B, ...]."""
         candidates, logits, value = self._prior(params, rng_key, state)
         return mctx.RootFnOutput(prior_logits=logits, value=value, embedding=Embedding(state, candidates))
 
     def recurrent_fn(self, params: SearchParams, rng_key: Array, action: Array,
-                     embedding: Embedding) -> tuple[mctx.RecurrentFnOutput, Embedding]:
+                     embedding: Embedding) -> tuple[Any, Embedding]:
         """One imagined step from each of B nodes; action int32 [B] indexes the node's candidates."""
         key_step, key_prior = jax.random.split(rng_key)
         chosen = jnp.take_along_axis(embedding.candidates, action[:, None, None], axis=1)[:, 0]
@@ -83,7 +83,7 @@ class MctxModel:
                                         prior_logits=logits, value=jnp.where(ends, 0.0, value))
         return output, Embedding(state, candidates)
 
-    def action(self, root: mctx.RootFnOutput, chosen: Array) -> Array:
+    def action(self, root: Any, chosen: Array) -> Array:
         """The continuous actions [B, 2] of the indices [B] that a search chose at `root`."""
         return jnp.take_along_axis(root.embedding.candidates, chosen[:, None, None], axis=1)[:, 0]
 

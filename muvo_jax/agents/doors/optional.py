@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import importlib
-from types import ModuleType
+from typing import Any
 
 
-def need(module: str, extra: str) -> ModuleType:
+def need(module: str, extra: str) -> Any:
     """Imports `module`.
 
     Raises:

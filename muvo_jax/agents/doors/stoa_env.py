@@ -12,9 +12,9 @@ from muvo_jax.agents import environment as environment_lib
 from muvo_jax.agents.doors import optional
 from muvo_jax.types import Array
 
-stoa = optional.need("stoa.environment", "stoa")
-stoa_types = optional.need("stoa.env_types", "stoa")
-stoa_spaces = optional.need("stoa.spaces", "stoa")
+Base: Any = optional.need("stoa.environment", "stoa").Environment
+stoa_types: Any = optional.need("stoa.env_types", "stoa")
+stoa_spaces: Any = optional.need("stoa.spaces", "stoa")
 
 
 @flax.struct.dataclass
@@ -25,7 +25,7 @@ class StoaState:
     rng_key: Array
 
 
-class StoaImagination(stoa.Environment):
+class StoaImagination(Base):
     """The core as a stoa Environment; env_params are the core's EnvParams (default: those given here).
 
     The discount is 0 where the drive terminated and 1 elsewhere, at the horizon too.

@@ -11,11 +11,11 @@ from muvo_jax.geometry import BirdsEyeGrid, PillarGrid, RangeViewGeometry, Voxel
 __all__ = ["ActionContract", "BirdsEyeGrid", "Config", "DataConfig", "EvaluationConfig", "LossConfig", "ModelConfig",
            "OptimizerConfig", "PillarGrid", "RangeViewGeometry", "TrainConfig", "VoxelGrid", "override", "parse"]
 
-FUSIONS = ("tr",)
-LIDAR_ENCODERS = ("rv",)
-CAMERA_ENCODERS = ("wob",)
+FUSIONS = ("tr", "fc", "avg")
+LIDAR_ENCODERS = ("rv", "pp")
+CAMERA_ENCODERS = ("wob", "bev")
 LATENTS = ("1d", "2d")
-BACKBONES = ("resnet18",)
+BACKBONES = ("resnet18", "mobilevitv2_100")
 HEADS = ("image", "range_view", "occupancy", "action")
 
 

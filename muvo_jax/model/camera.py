@@ -6,7 +6,6 @@ token_channels for fusion "tr", and otherwise in map_channels.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 
 import jax
@@ -73,11 +72,11 @@ class BirdsEyeCamera(linen.Module):
         logits = layers.Dense(grid.depth_bins, compute, name="depth")(
             pyramid.UpsamplingPyramid(channels, compute, name="depth_neck")(maps, mode))
         probabilities = jnp.moveaxis(jax.nn.softmax(logits.astype(jnp.float32), axis=-1), -1, 1)
-        count, bins, size = image.shape[0], grid.depth_bins, features.shape[1:3]
+        (count, rows, columns), bins = features.shape[:3], grid.depth_bins
         quirks = config.numerics == "reference"
-        points_m = frustum.frustum_points(frames["intrinsics"], frames["camera_to_ego"], size, _FINEST_STRIDE, bins,
-                                          corners=quirks)
-        cells = frustum.cell_indices(points_m, grid, truncate=quirks).reshape(count, bins, math.prod(size))
+        points_m = frustum.frustum_points(frames["intrinsics"], frames["camera_to_ego"], (rows, columns),
+                                          _FINEST_STRIDE, bins, corners=quirks)
+        cells = frustum.cell_indices(points_m, grid, truncate=quirks).reshape(count, bins, rows * columns)
         chosen = frustum.most_probable(probabilities.reshape(cells.shape), cells, grid.lifted_bins)
         lifted = frustum.lift_splat(features.reshape(count, -1, channels), *chosen, grid)
         if config.fusion != "tr" or config.many_tokens:

@@ -10,12 +10,14 @@ import pytest
 import muvo_jax
 
 PACKAGE = pathlib.Path(muvo_jax.__file__).parent
-BASE = {"types", "config", "ops"}
+BASE = {"types", "config", "config_json", "geometry", "ops"}
 ALLOWED = {
     "types": set(),
-    "config": set(),
+    "config_json": set(),
+    "geometry": set(),
+    "config": {"config_json", "geometry"},
     "presets": {"config"},
-    "ops": {"types", "config"},
+    "ops": {"types", "config", "geometry"},
     "nn": BASE,
     "model": BASE | {"nn"},
     "objectives": BASE | {"nn", "model"},

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import functools
+
 import jax
 import jax.numpy as jnp
 from flax import linen
@@ -12,20 +14,22 @@ from muvo_jax.nn import attention, layers, norm, resnet
 
 
 class Compression(linen.Module):
-    """[N, H, W, C] -> [N, features]: a halving block, a block, the mean over the map.
+    """[N, H, W, C] -> [N, features]: a halving block, a block (which halves too where `halvings` is 2), the mean.
 
-    Or all of its cells side by side, [N, H/2 * W/2 * features]: in a small preset the map has a handful of cells, and
-    their mean no longer says what stands left and what right.
+    Or all cells side by side, [N, H/2 * W/2 * features]: in a small preset the map has a handful of cells, and their
+    mean no longer says what stands left and what right.
     """
 
     features: int
-    keep_cells: bool = False
     compute: layers.Compute = layers.Compute()
+    halvings: int = 1
+    keep_cells: bool = False
 
     @linen.compact
     def __call__(self, x: jax.Array, mode: norm.Mode) -> jax.Array:
         x = resnet.BasicBlock(self.features, self.compute, stride=2, project=True, name="block0")(x, mode)
-        x = resnet.BasicBlock(self.features, self.compute, name="block1")(x, mode)
+        twice = self.halvings == 2
+        x = resnet.BasicBlock(self.features, self.compute, 2 if twice else 1, twice, name="block1")(x, mode)
         return x.reshape(x.shape[0], -1) if self.keep_cells else jnp.mean(x, axis=(1, 2))
 
 
@@ -58,15 +62,59 @@ class TransformerFusion(linen.Module):
             compute, name="transformer")(jnp.concatenate(tokens, axis=1), keys)
         if config.latent == "2d":
             return mixed.astype(jnp.float32)
-        image_vector = Compression(config.fused_channels, config.keep_cells, compute, name="image_compression")(
-            mixed[:, :image_count].reshape(image_map.shape), mode)
-        lidar_vector = Compression(config.fused_channels, config.keep_cells, compute, name="lidar_compression")(
-            mixed[:, image_count:].reshape(lidar_map.shape), mode)
+        compress = functools.partial(Compression, config.fused_channels, compute, keep_cells=config.keep_cells)
+        image_vector = compress(name="image_compression")(mixed[:, :image_count].reshape(image_map.shape), mode)
+        lidar_vector = compress(name="lidar_compression")(mixed[:, image_count:].reshape(lidar_map.shape), mode)
         joined = jnp.concatenate([image_vector, lidar_vector, *measurements], axis=-1)
         return layers.Dense(config.embedding_channels, compute, name="combine")(joined).astype(jnp.float32)
 
 
-REGISTRY = {"tr": TransformerFusion}
+class PooledFusion(linen.Module):
+    """What FC and AVG have in common: each sensor's map becomes one vector.
+
+    The measurements [N, measurement_channels] are spread over the image map [N, h, w, map_channels], which goes through
+    three levels of a ResNet-18 before it is compressed; the lidar map is compressed as it is. Result: [N,
+    embedding_channels].
+    """
+
+    config: ModelConfig
+
+    def vectors(self, image_map: jax.Array, lidar_map: jax.Array, measurements: list[jax.Array], mode: norm.Mode,
+                features: int) -> tuple[jax.Array, jax.Array]:
+        """The two vectors [N, features]; to be called in a compact method."""
+        config, compute = self.config, common.compute(self.config)
+        spread = [jnp.broadcast_to(value[:, None, None], (*image_map.shape[:3], value.shape[-1]))
+                  for value in measurements]
+        joined = jnp.concatenate([image_map, *spread], axis=-1)
+        (deep,) = resnet.ResNet18(config.backbone_width, (3,), compute, name="map_backbone")(joined, mode)
+        return (Compression(features, compute, name="image_state")(deep, mode),
+                Compression(features, compute, halvings=2, name="lidar_state")(lidar_map, mode))
+
+
+class ConcatenationFusion(PooledFusion):
+    """FC: both vectors side by side, then a dense layer."""
+
+    @linen.compact
+    def __call__(self, image_map: jax.Array, lidar_map: jax.Array, measurements: list[jax.Array], mode: norm.Mode,
+                 keys: jax.Array | None) -> jax.Array:
+        del keys
+        both = self.vectors(image_map, lidar_map, measurements, mode, self.config.fused_channels)
+        join = layers.Dense(self.config.embedding_channels, common.compute(self.config), name="join")
+        return join(jnp.concatenate(both, axis=-1)).astype(jnp.float32)
+
+
+class AverageFusion(PooledFusion):
+    """AVG: the mean of both vectors (the paper says so; in the reference's code the line is commented out)."""
+
+    @linen.compact
+    def __call__(self, image_map: jax.Array, lidar_map: jax.Array, measurements: list[jax.Array], mode: norm.Mode,
+                 keys: jax.Array | None) -> jax.Array:
+        del keys
+        image, lidar = self.vectors(image_map, lidar_map, measurements, mode, self.config.embedding_channels)
+        return 0.5 * (image.astype(jnp.float32) + lidar.astype(jnp.float32))
+
+
+REGISTRY: dict[str, type[linen.Module]] = {"tr": TransformerFusion, "fc": ConcatenationFusion, "avg": AverageFusion}
 
 
 def initial_constants(config: ModelConfig) -> dict[str, float]:

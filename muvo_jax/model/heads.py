@@ -76,7 +76,7 @@ def initial_constants(config: ModelConfig) -> dict[str, float]:
 
     Where the average training frame is the first guess, the last layers start at zero and add nothing to it.
     """
-    values = {}
+    values: dict[str, float] = {}
     for name, head in TABLE.items():
         if name not in config.heads or head.initial_bias is None:
             continue

@@ -51,7 +51,7 @@ def town() -> config_lib.Config:
         preset="town",
         model=model,
         loss=config_lib.LossConfig(image=1.5, image_squared=8.0, range_xyz=10.0, range_depth=2.0, chamfer=4.0,
-                                   occupancy_cross_entropy=2.0, occupancy_semantic_scal=0.05,
+                                   occupancy_cross_entropy=3.0, occupancy_semantic_scal=0.05,
                                    occupancy_geometric_scal=0.05, action=0.2, kl=5e-4),
         optimizer=config_lib.OptimizerConfig(learning_rate=2e-3, warmup_fraction=0.1, clip_norm=10.0),
         data=config_lib.DataConfig(frames=8),

@@ -2,10 +2,16 @@
 
 import argparse
 
+import jax
+import jax.numpy as jnp
 import worlds
 from brax.training.agents.ppo import train as ppo
 
 from muvo_jax.agents.doors import brax_env
+
+# Brax 0.14 calls a function that JAX 0.10 no longer has.
+if not hasattr(jax, "device_put_replicated"):
+    jax.device_put_replicated = lambda tree, devices: jax.tree.map(lambda leaf: jnp.stack([leaf] * len(devices)), tree)
 
 
 def main():

@@ -17,23 +17,23 @@ from muvo_jax.agents.doors import brax_env, gymnax_env, stoa_env
 CARS, STEPS = 256, 200
 
 
-def seconds(function, *arguments):
-    """Best of five calls, compilation left out."""
-    jax.block_until_ready(function(*arguments))
-    times = []
-    for _ in range(5):
-        start = time.perf_counter()
-        jax.block_until_ready(function(*arguments))
-        times.append(time.perf_counter() - start)
-    return min(times)
+def seconds(functions, rounds=7):
+    """Name -> best time of a function without arguments; they take turns, so that a busy machine slows all alike."""
+    for function in functions.values():
+        jax.block_until_ready(function())
+    best = dict.fromkeys(functions, float("inf"))
+    for _ in range(rounds):
+        for name, function in functions.items():
+            start = time.perf_counter()
+            jax.block_until_ready(function())
+            best[name] = min(best[name], time.perf_counter() - start)
+    return best
 
 
 def scan(step, carry):
-    """STEPS steps with auto-reset, jitted; the seconds it takes."""
-    def run(carry):
-        return jax.lax.scan(step, carry, jax.random.split(jax.random.key(0), STEPS))[1]
-
-    return seconds(jax.jit(run), carry)
+    """A function that makes STEPS steps with auto-reset, jitted."""
+    run = jax.jit(lambda carry: jax.lax.scan(step, carry, jax.random.split(jax.random.key(0), STEPS)))
+    return lambda: run(carry)
 
 
 def main():
@@ -48,9 +48,6 @@ def main():
                                                               out.final, params)
         return state, out.reward.sum() + out.observation.sum()
 
-    base_s = scan(core_step, jax.vmap(core.reset, (0, None))(keys, params)[1])
-    print(f"core with restart: {CARS * STEPS / base_s:,.0f} steps/s", flush=True)
-
     env = gymnax_env.GymnaxImagination(core, params)
 
     def gymnax_step(state, key):
@@ -58,7 +55,8 @@ def main():
             jax.random.split(key, CARS), state, actions, params)
         return state, reward.sum() + observation.sum()
 
-    doors = {"gymnax": (gymnax_step, jax.vmap(env.reset, (0, None))(keys, params)[1])}
+    doors = {"core": (core_step, jax.vmap(core.reset, (0, None))(keys, params)[1]),
+             "gymnax": (gymnax_step, jax.vmap(env.reset, (0, None))(keys, params)[1])}
     brax = training.wrap(brax_env.BraxImagination(core, params), episode_length=15)
 
     def brax_step(state, key):
@@ -75,14 +73,16 @@ def main():
         return state, timestep.reward.sum() + timestep.observation.sum()
 
     doors["stoa"] = (stoa_step, jax.vmap(stoa.reset)(keys)[0])
-    for name, (step, carry) in doors.items():
-        print(f"{name}: {scan(step, carry) / base_s:.2f} of the core's time", flush=True)
+    taken = seconds({name: scan(step, carry) for name, (step, carry) in doors.items()})
+    print(f"core with restart: {CARS * STEPS / taken['core']:,.0f} steps/s", flush=True)
+    for name in list(doors)[1:]:
+        print(f"{name}: {taken[name] / taken['core']:.2f} of the core's time", flush=True)
 
     model, dream = core.model, muvo_jax.imagine(core.model, params.variables, jax.random.key(0), params.bank.latent,
                                                 jnp.zeros((64, 100, 2)))
-    whole = seconds(lambda: muvo_jax.decode(model, params.variables, dream.states, heads=("image",)))
-    part = seconds(lambda: muvo_jax.decode(model, params.variables, dream.states[:, 50], heads=("image",)))
-    print(f"decoding 1 % of {64 * 100} images takes {part / whole:.1%} of decoding all", flush=True)
+    decode = lambda states: lambda: muvo_jax.decode(model, params.variables, states, heads=("image",))
+    taken = seconds({"whole": decode(dream.states), "part": decode(dream.states[:, 50])}, rounds=3)
+    print(f"decoding 1 % of {64 * 100} images takes {taken['part'] / taken['whole']:.1%} of decoding all", flush=True)
 
 
 if __name__ == "__main__":

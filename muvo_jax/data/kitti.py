@@ -101,7 +101,8 @@ class KittiRecording:
         others = [name for name in CAMERAS if any(_has(folder, name, ".png") for folder in folders)]
         if camera not in self._sensors and (others or len(self._sensors) < 2):
             raise schema.DataError(f"{path}: no drive has frames of {camera}; there are "
-                                   f"{', '.join(others) or 'none'} of other cameras. Unpack the synced drives, or name a camera that is there.")
+                                   f"{', '.join(others) or 'none'} of other cameras. Unpack the synced drives, or "
+                                   f"name a camera that is there.")
         whole = [folder for folder in folders
                  if all(_has(folder, sensor, suffix) for sensor, suffix in self._sensors.items())]
         if not whole:

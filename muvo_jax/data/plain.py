@@ -135,10 +135,13 @@ def _read_runs(root: pathlib.Path, split: str) -> list[_Run]:
 
 
 def _read_table(path: pathlib.Path) -> dict[str, np.ndarray]:
-    with path.open(newline="", encoding="utf-8") as file:
-        reader = csv.DictReader(file)
-        rows = list(reader)
-        header = reader.fieldnames or ()
+    try:
+        with path.open(newline="", encoding="utf-8") as file:
+            reader = csv.DictReader(file)
+            rows = list(reader)
+            header = reader.fieldnames or ()
+    except (UnicodeDecodeError, csv.Error) as error:
+        raise schema.DataError(f"{path}: not a CSV table ({error}). Record the run again.") from error
     lacking = [name for name in _COLUMNS if name not in header]
     if lacking:
         raise schema.DataError(f"{path}: column {', '.join(lacking)} is missing; the header has "

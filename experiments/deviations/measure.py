@@ -14,6 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from muvo_jax import config as config_lib
 from muvo_jax import geometry, presets, types
 from muvo_jax.data.town import settings
 from muvo_jax.data.town.simulator import Town
@@ -105,7 +106,8 @@ def pillar_offsets() -> tuple[str, str]:
     cloud = jnp.asarray(np.random.default_rng(0).uniform(-48, 48, (1, 4000, 3)), jnp.float32)
     index, cell = pillars.pillar_indices(cloud, jnp.asarray([4000], jnp.int32), grid)
     offsets = [pillars.decorate(cloud, index, cell, grid, swapped_corners=swapped)[..., 6] for swapped in (False, True)]
-    return tuple(f"{float(jnp.abs(offset).mean()):.2f}" for offset in offsets)
+    here, reference = (f"{float(jnp.abs(offset).mean()):.2f}" for offset in offsets)
+    return here, reference
 
 
 def lifted_share() -> tuple[str, str]:
@@ -118,7 +120,39 @@ def lifted_share() -> tuple[str, str]:
     for quirks in (False, True):
         rays = frustum.frustum_points(intrinsics[None], pose[None], size, 8, grid.depth_bins, corners=quirks)
         shares.append(f"{float((frustum.cell_indices(rays, grid, truncate=quirks) < grid.cells**2).mean()):.4f}")
-    return tuple(shares)
+    return shares[0], shares[1]
+
+
+def posterior_memory() -> tuple[str, str]:
+    """Mean change of the posterior's means where the mark of the state's tokens moves by N(0, 0.5), 2D town model."""
+    changes = []
+    for numerics in ("standard", "reference"):
+        config = dataclasses.replace(presets.get("town").model, latent="2d", numerics=numerics)
+        model = world_model.WorldModel(config)
+        params = model.init(jax.random.key(0))["params"]
+        mark = 0.5 * jax.random.normal(jax.random.key(1), (config.token_channels,))
+        embedding = jax.random.normal(jax.random.key(2), (4, 50, config.token_channels))
+        zeros = model.initial_state(4).stochastic
+        noise = types.StepNoise(zeros, zeros, jnp.zeros((4,), bool))
+
+        def means(table, model=model, params=params, embedding=embedding, noise=noise):
+            moved = {**params, "transition": {**params["transition"], "type_embedding": table}}
+            return model.observe_step({"params": moved}, noise, jnp.ones((4, 2)), model.initial_state(4), embedding,
+                                      jnp.zeros((4,), bool))[1][1].mean
+
+        table = jnp.asarray(params["transition"]["type_embedding"])
+        changes.append(f"{float(jnp.abs(jax.jit(means)(table.at[1].add(mark)) - jax.jit(means)(table)).mean()):.4f}")
+    return changes[0], changes[1]
+
+
+def decoder_parameters() -> tuple[str, str]:
+    """Parameters of the 2D model's decoders at the paper's size."""
+    counts = []
+    for numerics in ("standard", "reference"):
+        shapes = world_model.WorldModel(config_lib.ModelConfig(latent="2d", numerics=numerics)).variable_shapes()
+        decoders = [shape for name, shape in shapes["params"].items() if name.startswith("decoders_")]
+        counts.append(f"{sum(leaf.size for leaf in jax.tree.leaves(decoders)):,}")
+    return counts[0], counts[1]
 
 
 def rows() -> list[tuple[str, tuple[str, str]]]:
@@ -126,6 +160,8 @@ def rows() -> list[tuple[str, tuple[str, str]]]:
     frame = town_frame()
     return [
         ("mean size of the prior's means after 6 imagined steps, fresh town model", leaky_slope()),
+        ("change of the posterior's means with the mark of the state's tokens, 2D town model", posterior_memory()),
+        ("parameters of the 2D decoders at the paper's size", decoder_parameters()),
         ("KL of random Gaussians, 6 frames", first_step_kl(6)),
         ("KL of random Gaussians, 12 frames", first_step_kl(12)),
         ("share of steps in which 8 windows toss the same coin", prior_dropout_coin()),

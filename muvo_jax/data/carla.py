@@ -130,6 +130,7 @@ class CarlaRecording:
         self._runs = {run.name: run for run in kept}
         self._actions = {run.name: actions(run) for run in kept}
         self._speeds = {run.name: run.numbers("speed", 1)[:, 0] for run in kept}
+        self._yaw_rates = {run.name: yaw_rates(run) for run in kept if "imu" in run.columns}
         self._rewards = {run.name: np.clip(run.numbers("reward", 1)[:, 0], -1.0, 1.0) for run in kept}
         self.sequences = tuple(sequence for run in kept for sequence in _cut(run, modalities, skipped_s, rate_hz))
         present = {sequence.split for sequence in self.sequences}
@@ -157,6 +158,8 @@ class CarlaRecording:
             "reward": self._rewards[run.name][row], "is_terminal": np.bool_(False),
             "timestamp_s": np.float64(row / described.rate_hz), "frame_id": np.int64(row),
         }
+        if run.name in self._yaw_rates:
+            frame["yaw_rate_radps"] = self._yaw_rates[run.name][row]
         paths = {key: run.path(kind, row) for key, kind in _FILES.items() if key in described.modalities}
         if described.camera is not None and "image" in paths:
             camera = described.camera
@@ -184,6 +187,11 @@ def actions(run: Run) -> np.ndarray:
     """
     throttle, steer, brake = run.numbers("action", 3).T
     return np.stack([np.where(throttle > 0, throttle, -brake), steer], axis=1)
+
+
+def yaw_rates(run: Run) -> np.ndarray:
+    """Of every frame, rad/s, left positive, float32 [frames]: the gyroscope's z axis; CARLA counts it to the right."""
+    return -run.numbers("imu", 7)[:, 5]
 
 
 def folders(path: pathlib.Path) -> list[tuple[str, pathlib.Path]]:
@@ -244,6 +252,8 @@ def _read_run(split: str, folder: pathlib.Path) -> Run:
 def _modalities(runs: list[Run]) -> frozenset[str]:
     """The keys of RawFrame that at least one run has files of; where another run lacks one, its frames are left out."""
     names = {"speed_mps", "action", "reward", "is_terminal", "timestamp_s", "frame_id"}
+    if all("imu" in run.columns for run in runs):
+        names.add("yaw_rate_radps")
     names |= {key for key, kind in _FILES.items()
               if any(f"{kind}_path" in run.columns and run.path(kind, 0).parent.is_dir() for run in runs)}
     if "image" in names:

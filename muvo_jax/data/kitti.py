@@ -92,8 +92,8 @@ class KittiRecording:
             name=", ".join(self._drives), kind="KITTI raw", rate_hz=rate_hz,
             camera=next(iter(self._drives.values())).camera, lidar=LIDAR, voxels=None,
             contract=dataclasses.replace(CONTRACT, rate_hz=rate_hz),
-            modalities=frozenset(("image", "intrinsics", "camera_to_ego", "points_m", "speed_mps", "action",
-                                  "timestamp_s", "frame_id")),
+            modalities=frozenset(("image", "intrinsics", "camera_to_ego", "points_m", "speed_mps",
+                                  "yaw_rate_radps", "action", "timestamp_s", "frame_id")),
             splits=("train", "val"), notes=(_NOTE_SPLITS, _NOTE_ACTIONS))
 
     def read(self, sequence: schema.Sequence, index: int) -> schema.RawFrame:
@@ -115,6 +115,7 @@ class KittiRecording:
             "camera_to_ego": np.asarray(drive.camera.camera_to_ego, np.float32),
             "points_m": read_scan(points_path),
             "speed_mps": np.float32(speed_mps),
+            "yaw_rate_radps": np.float32(yaw_rate_radps),
             "action": derive_action(speed_mps, acceleration_mps2, yaw_rate_radps, self.description.contract),
             "timestamp_s": np.float64(drive.timestamps_s[position]),
             "frame_id": np.int64(frame_id),

@@ -28,7 +28,7 @@ FRAMES_FILE = "frames.csv"
 _FILES = {"image": ("image", ".png"), "points_m": ("lidar", ".npz"), "occupancy": ("occupancy", ".npz"),
           "route_map": ("route_map", ".png")}
 _COLUMNS = ("frame_id", "timestamp_s", "speed_mps", "acceleration", "steering")
-_OPTIONAL_COLUMNS = ("reward", "is_terminal")
+_OPTIONAL_COLUMNS = ("reward", "is_terminal", "yaw_rad")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -84,6 +84,8 @@ class PlainRecording:
             "timestamp_s": np.float64(columns["timestamp_s"][position]),
             "frame_id": np.int64(frame_id),
         }
+        if "yaw_rate_radps" in described.modalities:
+            frame["yaw_rate_radps"] = np.float32(columns["yaw_rate_radps"][position])
         if "reward" in described.modalities:
             frame["reward"] = np.float32(columns["reward"][position])
         if "is_terminal" in described.modalities:
@@ -139,7 +141,15 @@ def _read_table(path: pathlib.Path) -> dict[str, np.ndarray]:
     columns = {name: np.array([_number(path, line, name, row[name]) for line, row in enumerate(rows, start=2)])
                for name in _COLUMNS + optional}
     files.check_increasing(columns["timestamp_s"], [f"{path}, line {line + 2}" for line in range(len(rows))])
+    if "yaw_rad" in columns and len(rows) > 1:
+        columns["yaw_rate_radps"] = _rates(columns.pop("yaw_rad"), columns["timestamp_s"])
     return columns
+
+
+def _rates(yaw_rad: np.ndarray, timestamps_s: np.ndarray) -> np.ndarray:
+    """Turning between a frame and the next (the last frame: as the one before), rad/s."""
+    turned_rad = (np.diff(yaw_rad) + np.pi) % (2 * np.pi) - np.pi
+    return np.append(turned_rad, turned_rad[-1:]) / np.append(np.diff(timestamps_s), np.diff(timestamps_s)[-1:])
 
 
 def _number(path: pathlib.Path, line: int, name: str, text: str | None) -> float:
@@ -158,7 +168,8 @@ def _modalities(runs: list[_Run]) -> frozenset[str]:
     """The keys of RawFrame that at least one run has; where another run lacks one, its frames are left out."""
     names = {"speed_mps", "action", "timestamp_s", "frame_id"}
     names |= {key for key, (folder, _) in _FILES.items() if any((run.folder / folder).is_dir() for run in runs)}
-    names |= {name for name in _OPTIONAL_COLUMNS if all(name in run.columns for run in runs)}
+    names |= {name for name in ("reward", "is_terminal", "yaw_rate_radps")
+              if all(name in run.columns for run in runs)}
     if "image" in names:
         names |= {"intrinsics", "camera_to_ego"}
     return frozenset(names)

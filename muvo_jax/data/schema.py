@@ -34,6 +34,7 @@ class RawFrame(TypedDict, total=False):
       route_map: uint8 [64, 64].
       action: float32 [2], applied from this frame to the next.
       speed_mps, reward, is_terminal, timestamp_s: scalars.
+      yaw_rate_radps: measured, left positive; for checks, no model sees it.
       frame_id: the recording's own number.
     """
 
@@ -44,6 +45,7 @@ class RawFrame(TypedDict, total=False):
     occupancy: np.ndarray
     route_map: np.ndarray
     speed_mps: np.float32
+    yaw_rate_radps: np.float32
     action: np.ndarray
     reward: np.float32
     is_terminal: np.bool_

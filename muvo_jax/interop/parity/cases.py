@@ -20,12 +20,14 @@ class Check:
       got: our value, in torch's layout.
       tolerance: the largest error that passes.
       measure: (pack, entry, got) -> error; by default that of packs.Pack.error.
+      stands_alone: whether the expected value lies elsewhere than in the pack (in `measure`).
     """
 
     entry: str
     got: Any
     tolerance: float
     measure: Callable[[packs.Pack, str, Any], float] = packs.Pack.error
+    stands_alone: bool = False
 
 
 @dataclasses.dataclass(frozen=True)

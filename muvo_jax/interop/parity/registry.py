@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from muvo_jax.interop.parity import cases, losses, modules_1d
+from muvo_jax.interop.parity import cases, losses, modules_1d, p6
 
 _INFORMATION = "stored for information only"
 
 PACKS = (
     cases.PackChecks("p1", (r"p1_losses_metrics\.npz",), losses.GROUPS),
     cases.PackChecks("p3_1d", (r"p3_modules_1d\.npz",), modules_1d.GROUPS),
-    cases.PackChecks("p6", (r"p6_\w+\.npz",), (), needs_recordings=True),
+    cases.PackChecks("p6", (r"p6_\w+\.npz",), p6.GROUPS, needs_recordings=True),
 )

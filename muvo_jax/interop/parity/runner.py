@@ -87,7 +87,7 @@ def run_pack(checks: cases.PackChecks, context: cases.Context, report: Report, w
     for group in () if skipped else checks.groups:
         try:
             for check in group(context):
-                if check.entry in context.pack and check.entry not in done:
+                if (check.stands_alone or check.entry in context.pack) and check.entry not in done:
                     done.add(check.entry)
                     _record(check, context.pack, label, report, write)
         except Exception as error:  # one group must not hide the others; its entries are then left out, which fails

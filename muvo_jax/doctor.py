@@ -1,0 +1,146 @@
+"""python -m muvo_jax.doctor PATH: what a recording holds, what is wrong with it, and pictures to see for oneself."""
+
+from __future__ import annotations
+
+import dataclasses
+import pathlib
+import sys
+import warnings
+from typing import Annotated
+
+import numpy as np
+import tyro
+
+from muvo_jax import command_line
+from muvo_jax import config as config_lib
+from muvo_jax.data import checkup, schema, sources
+from muvo_jax.ops import voxels as voxel_ops
+from muvo_jax.training import screen
+from muvo_jax.viz import canvas, checks
+
+
+@dataclasses.dataclass(frozen=True)
+class Options:
+    """Looks a recording over before anything is trained on it: sensors, gaps, damaged files, actions, alignment.
+
+    Works on every format that training does. Writes report.md and pictures; ends with exit code 1 where something
+    should be mended.
+    """
+
+    path: Annotated[pathlib.Path, tyro.conf.Positional, tyro.conf.arg(metavar="PATH")]
+    """Folder of a recording."""
+    out: Annotated[pathlib.Path | None, command_line.shown("FOLDER", "doctor/NAME")] = None
+    """Where the report goes."""
+    frames: int = 600
+    """How many frames to read, spread over the recording; 0 reads all."""
+
+
+EXAMPLES = """
+python -m muvo_jax.doctor /data/kitti_raw
+python -m muvo_jax.doctor /data/muvo --frames=0  (reads every file)
+python -m muvo_jax.doctor recordings/mine --out=look
+"""
+
+
+class RecordingProblems(ValueError):
+    """Problems were found; they have been told already."""
+
+
+def examine(options: Options, show: screen.Screen) -> checkup.Checkup:
+    """Does what the command line asks for.
+
+    Raises:
+      DataError: where the folder cannot be opened at all.
+      RecordingProblems: where something should be mended, after everything has been written.
+    """
+    recording, warned = open_recording(options.path)
+    with show.counter("looking at", "frames") as progress:
+        result = checkup.examine(recording, warned, frames=options.frames, progress=progress)
+    out = options.out or pathlib.Path("doctor") / recording.description.name.split(",")[0]
+    for name, value in result.facts.items():
+        show.field(name, value)
+    for finding in result.findings:
+        show.line(f"{finding.level}: {finding.text}", style="bold red" if finding.level == "problem" else "")
+    pictures = draw(recording.description, result, out)
+    for path in (write_report(out, result, pictures), *pictures):
+        show.line(f"wrote {path}")
+    if result.problems:
+        raise RecordingProblems(f"{result.problems} problems found in {options.path}; see {out / 'report.md'}")
+    show.line("no problem found.")
+    return result
+
+
+def open_recording(path: pathlib.Path) -> tuple[schema.Recording, list[str]]:
+    """The recording and what opening it warned of."""
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        recording = sources.open_recording(path)
+    return recording, [str(warning.message) for warning in caught if issubclass(warning.category, schema.DataWarning)]
+
+
+def draw(described: schema.RecordingDescription, result: checkup.Checkup, out: pathlib.Path) -> list[pathlib.Path]:
+    """Writes overlays of a few frames, and the actions beside the motion of the first stretch that moves."""
+    written = []
+    every = len(result.pictures)
+    for number in sorted({every // 6, every // 2, every * 5 // 6}) if every else []:
+        sample = result.pictures[number]
+        frame = sample.frame
+        parts = []
+        if "points_m" in frame and "image" in frame:
+            overlay = checks.lidar_in_image(frame["image"], frame["points_m"], frame["intrinsics"],
+                                            frame["camera_to_ego"])
+            parts.append(canvas.caption(overlay, "lidar in the image: pale is near"))
+        elif "image" in frame:
+            parts.append(canvas.caption(frame["image"], "image"))
+        if "points_m" in frame:
+            parts.append(checks.above(frame["points_m"], *_voxels(frame, described)))
+        if parts:
+            title = f"{sample.sequence.name}, frame {int(frame['frame_id'])}"
+            page = canvas.margin(canvas.caption(canvas.stack(parts, axis=0), title, size_px=17))
+            written.append(canvas.save_png(out / f"overlay_{number:02d}.png", page))
+    motion = result.motion
+    if len(motion.stretch):
+        number = _liveliest(motion)
+        chosen = motion.stretch == number
+        time_s = motion.timestamp_s[chosen] - motion.timestamp_s[chosen][0]
+        page = checks.action_against_motion(time_s, motion.action[chosen, 1], motion.yaw_rate_radps[chosen],
+                                            motion.action[chosen, 0], motion.acceleration_mps2[chosen])
+        page = canvas.margin(canvas.caption(page, "actions beside measured motion (s)", size_px=17))
+        written.append(canvas.save_png(out / "actions.png", page))
+    return written
+
+
+def _voxels(frame: schema.RawFrame, described: schema.RecordingDescription):
+    """Occupancy and its grid: as recorded, else what the frame's own scan gives for a target."""
+    if "occupancy" in frame or described.lidar is None:
+        return frame.get("occupancy"), described.voxels
+    grid = config_lib.VoxelGrid()
+    lidar_m = np.array(described.lidar.position_m, np.float32)
+    return voxel_ops.occupancy_target(frame["points_m"], lidar_m, grid), grid
+
+
+def _liveliest(motion: checkup.judgements.Motion) -> int:
+    """The stretch that steers most."""
+    numbers = np.unique(motion.stretch)
+    return int(max(numbers, key=lambda number: motion.action[motion.stretch == number, 1].std()))
+
+
+def write_report(out: pathlib.Path, result: checkup.Checkup, pictures: list[pathlib.Path]) -> pathlib.Path:
+    """OUT/report.md."""
+    lines = ["# What is there", "", "| | |", "|---|---|", *(f"| {name} | {value} |" for name, value in
+                                                            result.facts.items()), ""]
+    for level, title in (("problem", "# What should be mended"), ("remark", "# What should be known")):
+        texts = [finding.text for finding in result.findings if finding.level == level]
+        lines += [title, "", *(f"* {text}" for text in texts or ["nothing"]), ""]
+    lines += [f"![{path.stem}]({path.name})" for path in pictures]
+    out.mkdir(parents=True, exist_ok=True)
+    (out / "report.md").write_text("\n".join(lines) + "\n", encoding="utf-8")
+    return out / "report.md"
+
+
+def main() -> int:
+    return command_line.run(Options, examine, program="doctor", examples=EXAMPLES)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -115,7 +115,7 @@ def to_our_layout(leaf: str, shape: tuple[int, ...], value: np.ndarray) -> np.nd
     if leaf == "type_embedding":
         return value[0, 0].T
     if leaf.startswith("query_"):  # (1, C, *grid), or (1, 1, C) for a single token
-        return value[0] if value.ndim == 3 else value[0].reshape(value.shape[1], -1).T
+        return value[0] if leaf == "query_action" else value[0].reshape(value.shape[1], -1).T
     if leaf == "constant":
         return np.moveaxis(value, 0, -1)
     if leaf in ("seed_kernel", "transposed_kernel"):

@@ -10,13 +10,14 @@ Everything is a pure function of explicit pytrees; see docs/design.md.
 
 from muvo_jax import presets
 from muvo_jax.config import Config, ModelConfig
+from muvo_jax.model.live import LiveState, observe_step, start_live
 from muvo_jax.model.rollout import decode, imagine, observe
 from muvo_jax.model.world_model import WorldModel
 from muvo_jax.types import Batch, Dream, Gaussian, LatentState, Observed
 
 __all__ = [
-    "Batch", "Config", "Dream", "Gaussian", "LatentState", "ModelConfig", "Observed", "WorldModel",
-    "decode", "imagine", "load", "observe", "presets",
+    "Batch", "Config", "Dream", "Gaussian", "LatentState", "LiveState", "ModelConfig", "Observed", "WorldModel",
+    "decode", "imagine", "load", "observe", "observe_step", "presets", "start_live",
 ]
 
 

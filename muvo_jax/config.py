@@ -3,50 +3,20 @@
 from __future__ import annotations
 
 import dataclasses
-import difflib
-import types
-import typing
 from typing import Any, Literal
+
+from muvo_jax.config_json import check_choice, override, parse
+from muvo_jax.geometry import BirdsEyeGrid, PillarGrid, RangeViewGeometry, VoxelGrid
+
+__all__ = ["ActionContract", "BirdsEyeGrid", "Config", "DataConfig", "EvaluationConfig", "LossConfig", "ModelConfig",
+           "OptimizerConfig", "PillarGrid", "RangeViewGeometry", "TrainConfig", "VoxelGrid", "override", "parse"]
 
 FUSIONS = ("tr",)
 LIDAR_ENCODERS = ("rv",)
 CAMERA_ENCODERS = ("wob",)
 LATENTS = ("1d", "2d")
+BACKBONES = ("resnet18",)
 HEADS = ("image", "range_view", "occupancy", "action")
-
-
-def _check_choice(what: str, value: str, known: tuple[str, ...]) -> None:
-    if value in known:
-        return
-    near = difflib.get_close_matches(str(value), known, n=2)
-    hint = f" Did you mean {' or '.join(near)}?" if near else ""
-    raise ValueError(f"{what}: {value!r} is unknown; known are {', '.join(known)}.{hint}")
-
-
-@dataclasses.dataclass(frozen=True)
-class RangeViewGeometry:
-    """A lidar as a cylinder of pixels: row 0 looks highest, the middle column looks forward, columns grow to the right.
-
-    Attributes:
-      rows, columns: size in pixels.
-      elevation_min_rad, elevation_max_rad: vertical field of view; points outside it fall into the edge rows.
-      position_m: where the lidar sits in the ego frame.
-    """
-
-    rows: int = 64
-    columns: int = 1024
-    elevation_min_rad: float = -0.5235987755982988  # -30 degrees
-    elevation_max_rad: float = 0.17453292519943295  # +10 degrees
-    position_m: tuple[float, float, float] = (1.0, 0.0, 2.0)
-
-
-@dataclasses.dataclass(frozen=True)
-class VoxelGrid:
-    """A box of cubic voxels in the ego frame; `origin_m` is its lower corner."""
-
-    shape: tuple[int, int, int] = (192, 192, 64)
-    voxel_size_m: float = 0.5
-    origin_m: tuple[float, float, float] = (-48.0, -48.0, -6.0)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -79,8 +49,15 @@ class ModelConfig:
       numerics: "standard" follows the mathematics, "reference" the authors' code (DEVIATIONS.md lists the difference).
       heads: what is decoded; a modality that the data lacks has no head.
       route, speed: whether the planned route and the speed are inputs.
+      navigation: whether the route's command, the next one and the GPS targets are inputs.
+      backbone: of image and range view; pillars, route and the maps of fc and avg keep a ResNet-18.
+      many_tokens: fusion "tr" sees the finest maps, 16 times as many tokens (the reference's LARGE).
       image_size: rows, columns in pixels, each a multiple of 32.
-      backbone_width: channels of the first ResNet-18 level (the others are 2, 4 and 8 times as wide).
+      pillars: the grid of lidar "pp".
+      birds_eye: the grid of camera "bev".
+      backbone_width: channels of the first ResNet-18 level (the others are 2, 4 and 8 times as wide); the levels of
+        mobilevitv2_100 are 2, 4, 6 and 8 times as wide.
+      map_channels: of the maps that fusions "fc" and "avg" pool.
       token_channels, transformer_*: the fusion transformer.
       fused_channels: channels of each sensor's pooled vector after fusion.
       embedding_channels: size of the observation embedding.
@@ -107,10 +84,16 @@ class ModelConfig:
     heads: tuple[str, ...] = HEADS
     route: bool = True
     speed: bool = True
+    navigation: bool = False
+    backbone: str = "resnet18"
+    many_tokens: bool = False
     image_size: tuple[int, int] = (320, 832)
     range_view: RangeViewGeometry = RangeViewGeometry()
     voxels: VoxelGrid = VoxelGrid()
+    pillars: PillarGrid = PillarGrid()
+    birds_eye: BirdsEyeGrid = BirdsEyeGrid()
     backbone_width: int = 64
+    map_channels: int = 64
     token_channels: int = 384
     transformer_layers: int = 6
     transformer_heads: int = 8
@@ -140,10 +123,10 @@ class ModelConfig:
 
     def __post_init__(self):
         for name, known in (("fusion", FUSIONS), ("lidar", LIDAR_ENCODERS), ("camera", CAMERA_ENCODERS),
-                            ("latent", LATENTS)):
-            _check_choice(f"model.{name}", getattr(self, name), known)
+                            ("latent", LATENTS), ("backbone", BACKBONES)):
+            check_choice(f"model.{name}", getattr(self, name), known)
         for head in self.heads:
-            _check_choice("model.heads", head, HEADS)
+            check_choice("model.heads", head, HEADS)
         if any(side % 32 for side in self.image_size):
             raise ValueError(f"model.image_size {self.image_size}: rows and columns must be multiples of 32.")
         if self.range_view.rows % 32 or self.range_view.columns % 32:
@@ -161,6 +144,31 @@ class ModelConfig:
         if (tokens or "occupancy" in self.heads) and any(side % shrink for side in self.voxels.shape):
             raise ValueError(f"model.voxels.shape {self.voxels.shape}: each side must be a multiple of {shrink} "
                              f"(2**({field} + 3)).")
+        self._check_variant()
+
+    def _check_variant(self):
+        """Refuses combinations that make no sense."""
+        if self.fusion != "tr":
+            for setting, chosen, why in (
+                    ("latent=2d", self.latent == "2d", "the 2D latent is made of tokens, and only tr keeps tokens"),
+                    ("many_tokens=true", self.many_tokens, "only tr has tokens")):
+                if chosen:
+                    raise ValueError(f"model.{setting} with model.fusion={self.fusion}: {why}. Choose model.fusion=tr.")
+        if self.lidar == "pp" and (self.pillars.cells < 32 or self.pillars.cells % 32):
+            raise ValueError(f"model.pillars has {self.pillars.cells} cells on a side (2 * half_side_m * cells_per_m); "
+                             f"it must be a multiple of 32.")
+        if self.camera == "bev":
+            grid = self.birds_eye
+            if grid.cells < 4 or grid.cells % 4 or not 1 <= grid.lifted_bins <= grid.depth_bins:
+                raise ValueError(f"model.birds_eye: cells {grid.cells} must be a multiple of 4, and lifted_bins "
+                                 f"{grid.lifted_bins} lie between 1 and depth_bins {grid.depth_bins}.")
+        if self.backbone == "mobilevitv2_100":
+            view = self.range_view
+            sides = self.image_size + ((view.rows, view.columns) if self.lidar == "rv" and self.latent == "1d" else ())
+            if any(side % 64 for side in sides):
+                raise ValueError(f"model.backbone=mobilevitv2_100 cuts its deepest maps into 2x2 patches: sides "
+                                 f"{list(sides)} of image and range view must be multiples of 64. "
+                                 f"Choose other sizes or model.backbone=resnet18.")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -308,55 +316,3 @@ class Config:
           ValueError: for an unknown field (naming the nearest known one) or a value of the wrong type.
         """
         return parse(cls, values, "config")
-
-
-def parse(cls, values: dict[str, Any], path: str):
-    """Builds the config dataclass `cls` from parsed JSON or TOML; `path` names the source in messages.
-
-    Raises:
-      ValueError: for an unknown field (naming the nearest known one) or a value of the wrong type.
-    """
-    if not isinstance(values, dict):
-        raise ValueError(f"{path}: got {values!r}, expected the fields of {cls.__name__}.")
-    hints = typing.get_type_hints(cls)
-    for name in values:
-        _check_choice(f"{path} ({cls.__name__})", name, tuple(hints))
-    return cls(**{name: _coerce(hints[name], value, f"{path}.{name}") for name, value in values.items()})
-
-
-def override(config, dotted: str, value: Any):
-    """Returns `config` with one dotted field replaced: `override(config, "model.dropout", 0.0)`.
-
-    Raises:
-      ValueError: for an unknown field, naming the nearest known one, or a value of the wrong type.
-    """
-    values = dataclasses.asdict(config)
-    node = values
-    *parents, leaf = dotted.split(".")
-    for name in parents:
-        _check_choice(f"field of {dotted!r}", name, tuple(node))
-        node = node[name]
-    _check_choice(f"field of {dotted!r}", leaf, tuple(node))
-    node[leaf] = value
-    return parse(type(config), values, "config")
-
-
-def _coerce(hint, value, path: str):
-    """Returns `value` as `hint` wants it (JSON lists become tuples, whole floats stay floats), or raises."""
-    if dataclasses.is_dataclass(hint):
-        return parse(hint, value, path)
-    origin, arguments = typing.get_origin(hint), typing.get_args(hint)
-    if origin is Literal:
-        _check_choice(path, value, arguments)
-        return value
-    if origin is tuple and isinstance(value, (list, tuple)):
-        inner = arguments[:1] * len(value) if arguments[-1] is Ellipsis else arguments
-        if len(inner) == len(value):
-            return tuple(_coerce(kind, item, path) for kind, item in zip(inner, value, strict=True))
-    if origin is types.UnionType and value is None and type(None) in arguments:
-        return None
-    if hint is float and isinstance(value, int) and not isinstance(value, bool):
-        return float(value)
-    if isinstance(hint, type) and isinstance(value, hint) and (hint is bool or not isinstance(value, bool)):
-        return value
-    raise ValueError(f"{path}: got {value!r}, expected {getattr(hint, '__name__', hint)}.")

@@ -48,9 +48,13 @@ class Batch(_Indexable):
       image: uint8 [B, T, H, W, 3], RGB.
       range_view: float32 [B, T, Hr, Wr, 4], x, y, z (ego frame, m) and range from the lidar (m);
         0, 0, 0 and -1 where nothing returned.
+      points: float32 [B, T, N, 3], the scan, ego frame, m; only where PointPillars reads it.
+      point_count: int32 [B, T], how many of the N rows are points; the others are ignored.
       occupancy: uint8 [B, T, X, Y, Z], 0 empty, 1 occupied, 255 unknown.
       route_map: uint8 [B, T, 64, 64], planned route from above, 255 on route; row 0 is farthest ahead.
       speed_mps: float32 [B, T].
+      command, next_command: int32 [B, T], what the navigation says, 0 to 5, and what it will say then.
+      target_m, next_target_m: float32 [B, T, 2], the places that the two commands belong to, seen from the ego.
       reward: float32 [B, T].
       is_terminal: bool [B, T].
       intrinsics: float32 [B, 3, 3], of the image as it is here, after resizing and cropping.
@@ -61,9 +65,15 @@ class Batch(_Indexable):
     is_first: ArrayLike
     image: ArrayLike | None = None
     range_view: ArrayLike | None = None
+    points: ArrayLike | None = None
+    point_count: ArrayLike | None = None
     occupancy: ArrayLike | None = None
     route_map: ArrayLike | None = None
     speed_mps: ArrayLike | None = None
+    command: ArrayLike | None = None
+    next_command: ArrayLike | None = None
+    target_m: ArrayLike | None = None
+    next_target_m: ArrayLike | None = None
     reward: ArrayLike | None = None
     is_terminal: ArrayLike | None = None
     intrinsics: ArrayLike | None = None
@@ -106,7 +116,9 @@ class Batch(_Indexable):
 
 _BATCH_FIELDS = {
     "action": (np.float32, 3), "is_first": (np.bool_, 2), "image": (np.uint8, 5), "range_view": (np.float32, 5),
-    "occupancy": (np.uint8, 5), "route_map": (np.uint8, 4), "speed_mps": (np.float32, 2), "reward": (np.float32, 2),
+    "points": (np.float32, 4), "point_count": (np.int32, 2), "command": (np.int32, 2), "next_command": (np.int32, 2),
+    "target_m": (np.float32, 3), "next_target_m": (np.float32, 3), "occupancy": (np.uint8, 5),
+    "route_map": (np.uint8, 4), "speed_mps": (np.float32, 2), "reward": (np.float32, 2),
     "is_terminal": (np.bool_, 2), "intrinsics": (np.float32, 3), "camera_to_ego": (np.float32, 3),
 }
 

@@ -7,11 +7,13 @@ on the number of devices.
 from __future__ import annotations
 
 import functools
+import math
 from collections.abc import Callable, Sequence
 
 import jax
 import jax.numpy as jnp
 
+from muvo_jax.model import checks
 from muvo_jax.model.world_model import WorldModel
 from muvo_jax.types import ArrayLike, Batch, Dream, LatentState, Observed, Predictions, StepNoise, Variables
 
@@ -46,13 +48,17 @@ def draw_noise(keys: jax.Array, frames: int, shape: tuple[int, ...], prior_dropo
     Returns:
       StepNoise [B, T, ...]; frame t of a sample depends on its key and on t only.
     """
-    def step(key):
-        key_prior, key_posterior, key_coin = jax.random.split(key, 3)
-        return StepNoise(jax.random.normal(key_prior, shape, dtype), jax.random.normal(key_posterior, shape, dtype),
-                         jax.random.bernoulli(key_coin, prior_dropout),
-                         jax.random.fold_in(key, _DROPOUT_SITE) if dropout else None)
+    draw = lambda key: frame_noise(key, shape, prior_dropout, dtype, dropout=dropout)
+    return jax.vmap(jax.vmap(draw))(jax.vmap(lambda key: _fold_each(key, frames))(keys))
 
-    return jax.vmap(jax.vmap(step))(jax.vmap(lambda key: _fold_each(key, frames))(keys))
+
+def frame_noise(key: jax.Array, shape: tuple[int, ...], prior_dropout: float = 0.0, dtype=jnp.float32, *,
+                dropout: bool = False) -> StepNoise:
+    """The noise of one sample's observed frame, whose key is fold_in(the sample's, t); see draw_noise."""
+    key_prior, key_posterior, key_coin = jax.random.split(key, 3)
+    return StepNoise(jax.random.normal(key_prior, shape, dtype), jax.random.normal(key_posterior, shape, dtype),
+                     jax.random.bernoulli(key_coin, prior_dropout),
+                     jax.random.fold_in(key, _DROPOUT_SITE) if dropout else None)
 
 
 def mean_mode(noise: StepNoise) -> StepNoise:
@@ -118,37 +124,48 @@ def observe(model: WorldModel, variables: Variables, key: jax.Array, batch: Batc
 
 
 def imagine(model: WorldModel, variables: Variables, key: jax.Array, state: LatentState,
-            actions_or_policy: jax.Array | Policy, *, horizon: int | None = None, branches: int | None = None,
-            sampled: bool = True) -> Dream:
-    """Dreams on from states [B, ...] without observations. Compiled once per model, shapes and policy function.
+            actions_or_policy: ArrayLike | Policy, *, horizon: int | None = None, branches: int | None = None,
+            sampled: bool = True, temperature: float | jax.Array = 1.0, same_noise: bool = False) -> Dream:
+    """Dreams on from latent states without observations. Compiled once per model, shapes and policy function.
+
+    `jit`, `vmap`, `grad` and `jvp` work from outside. Shapes and keys are always checked, the values of actions where
+    they are concrete (not traced), all before anything is compiled. Nothing is decoded; see `decode`.
 
     Args:
       model, variables: the model.
-      key: typed key, or one per sample [B]; branch n of a sample uses fold_in(key, n), step k of it fold_in(key, k).
-      state: LatentState [B, ...], for example Observed.last.
-      actions_or_policy: actions [B, H, 2] or [B, N, H, 2], the first one being applied at `state`; or a policy, called
-        for each sample and step as policy(key, features [D + S]) -> action [2] under vmap (features [N, 2 C] with the
-        2D latent, of which WorldModel.policy_features makes one vector). Give a policy that has parameters as
-        jax.tree_util.Partial(function, parameters), so that new parameters do not compile anew.
+      key: typed key, or one per state [*L]; branch n of a state uses fold_in(key, n), step k of it fold_in(key, k).
+      state: LatentState [*L, ...] with any leading axes: [B] as in Observed.last, [B, T] as in Observed.states (a dream
+        from every frame of a window), or none.
+      actions_or_policy: actions [*L, H, 2] or [*L, N, H, 2] in [-1, 1], the first one being applied at `state`; or a
+        policy, called for each state and step as policy(key, features [D + S]) -> action [2] under vmap (features
+        [N, 2 C] with the 2D latent, of which WorldModel.policy_features makes one vector); what it returns is clipped
+        to [-1, 1]. Give a policy that has parameters as jax.tree_util.Partial(function, parameters), so that new
+        parameters do not compile anew.
       horizon: H; needed with a policy, otherwise checked.
-      branches: N futures of each state; results have the axes [B, N, H, ...]. Inferred from actions with four axes.
+      branches: N futures of each state; results have the axes [*L, N, H, ...]. Inferred from actions that have them.
       sampled: sample the latents; otherwise take their means.
+      temperature: factor on the standard deviation of the latents where sampled; may be traced.
+      same_noise: all branches of a state draw the same noise, so that they differ by their actions alone.
 
     Raises:
-      ValueError: if shapes, horizon, branches or key do not fit together.
+      ValueError: if shapes, values, horizon, branches or key do not fit; the message names what came.
     """
-    batch_size = state.deterministic.shape[0]
-    keys = sample_keys(key, batch_size)
+    lead = checks.state(model, state)
+    count = math.prod(lead)
+    keys = sample_keys(key.reshape(-1) if lead and getattr(key, "shape", None) == lead else key, count)
     driver: jax.Array | jax.tree_util.Partial
     if callable(actions_or_policy):
-        if horizon is None:
-            raise ValueError("imagine: a policy needs a horizon; pass horizon=number of steps.")
         policy = actions_or_policy
         driver = policy if isinstance(policy, jax.tree_util.Partial) else jax.tree_util.Partial(policy)
     else:
-        driver = actions = jnp.asarray(actions_or_policy)
-        branches, horizon = _check_actions(actions, batch_size, horizon, branches)
-    return _imagine(model, variables, keys, state, driver, horizon, branches, sampled)
+        driver = jnp.asarray(actions_or_policy, jnp.float32)
+        branches, horizon = checks.actions(actions_or_policy, lead, horizon, branches)
+        driver = driver.reshape(count, *driver.shape[len(lead):])
+    horizon = checks.counts(horizon, branches)
+    flat = jax.tree.map(lambda leaf: leaf.reshape(count, *leaf.shape[len(lead):]), state)
+    dream = _imagine(model, variables, keys, flat, driver, jnp.float32(temperature), horizon, branches, sampled,
+                     same_noise)
+    return jax.tree.map(lambda leaf: leaf.reshape(*lead, *leaf.shape[1:]), dream)
 
 
 def decode(model: WorldModel, variables: Variables, states: LatentState | Dream | jax.Array,
@@ -166,18 +183,6 @@ def learned_policy(model: WorldModel, variables: Variables) -> Policy:
 def _decode_action(model, variables, key, features):
     del key
     return model.decode(variables, features, ("action",))["action"][1]
-
-
-def _check_actions(actions, batch_size, horizon, branches):
-    """Returns (branches, horizon) as the actions imply them."""
-    if actions.ndim not in (3, 4) or actions.shape[0] != batch_size or actions.shape[-1] != 2:
-        raise ValueError(f"imagine: got actions {list(actions.shape)}, expected [{batch_size}, H, 2] or "
-                         f"[{batch_size}, N, H, 2].")
-    if horizon is not None and horizon != actions.shape[-2]:
-        raise ValueError(f"imagine: horizon={horizon}, but there are {actions.shape[-2]} actions; leave horizon out.")
-    if actions.ndim == 4 and branches not in (None, actions.shape[1]):
-        raise ValueError(f"imagine: branches={branches}, but the actions have {actions.shape[1]}; leave branches out.")
-    return (actions.shape[1] if actions.ndim == 4 else branches), actions.shape[-2]
 
 
 def _fold_each(key, count):
@@ -198,33 +203,37 @@ def _decode(model, variables, features, heads):
     return model.decode(variables, features, heads)
 
 
-@functools.partial(jax.jit, static_argnames=("model", "horizon", "branches", "sampled"))
-def _imagine(model, variables, keys, state, driver, horizon, branches, sampled):
+@functools.partial(jax.jit, static_argnames=("model", "horizon", "branches", "sampled", "same_noise"))
+def _imagine(model, variables, keys, state, driver, temperature, horizon, branches, sampled, same_noise):
     """Merges branches into the batch, scans, and parts them again."""
+    walk = functools.partial(_imagine_flat, model, variables, temperature=temperature if sampled else None,
+                             horizon=horizon)
     if branches is None:
-        return _imagine_flat(model, variables, keys, state, driver, horizon, sampled)
+        return walk(keys, keys, state, driver)
     batch_size = keys.shape[0]
     spread = lambda leaf: jnp.repeat(leaf, branches, axis=0)
     merge = lambda leaf: leaf.reshape(batch_size * branches, *leaf.shape[2:])
-    keys = merge(jax.vmap(lambda key: _fold_each(key, branches))(keys))
+    branch_keys = merge(jax.vmap(lambda key: _fold_each(key, branches))(keys))
     if not callable(driver):
         driver = merge(driver) if driver.ndim == 4 else spread(driver)
-    dream = _imagine_flat(model, variables, keys, jax.tree.map(spread, state), driver, horizon, sampled)
+    dream = walk(spread(keys) if same_noise else branch_keys, branch_keys, jax.tree.map(spread, state), driver)
     return jax.tree.map(lambda leaf: leaf.reshape(batch_size, branches, *leaf.shape[1:]), dream)
 
 
-def _imagine_flat(model, variables, keys, state, driver, horizon, sampled):
+def _imagine_flat(model, variables, keys_noise, keys_policy, state, driver, *, temperature, horizon):
     shape = state.stochastic.shape[1:]
+    fold = jax.vmap(jax.random.fold_in, (0, None))
 
     def step(state, inputs):
         index, action = inputs
-        step_keys = jax.vmap(jax.random.fold_in, (0, None))(keys, index)
         if callable(driver):
-            action = jax.vmap(driver)(jax.vmap(jax.random.fold_in, (0, None))(step_keys, 1), state.features)
-        if sampled:
-            noise = jax.vmap(lambda key: jax.random.normal(jax.random.fold_in(key, 0), shape))(step_keys)
-        else:
+            keys = fold(fold(keys_policy, index), 1)
+            action = checks.policy_action(jax.vmap(driver)(keys, state.features), state.features)
+        if temperature is None:
             noise = jnp.zeros_like(state.stochastic)
+        else:
+            keys = fold(fold(keys_noise, index), 0)
+            noise = temperature * jax.vmap(lambda key: jax.random.normal(key, shape))(keys)
         state, prior = model.imagine_step(variables, noise, action, state)
         return state, (state, action, prior)
 

@@ -37,7 +37,8 @@ class BatchNorm(linen.Module):
     epsilon: float = 1e-5
 
     @linen.compact
-    def __call__(self, x: jax.Array, mode: Mode) -> jax.Array:
+    def __call__(self, x: jax.Array, mode: Mode, mask: jax.Array | None = None) -> jax.Array:
+        """mask: bool [...], which rows the moments are taken over; None means all."""
         channels = x.shape[-1]
         scale = self.param("scale", layers.shape_only, (channels,))
         bias = self.param("bias", layers.shape_only, (channels,))
@@ -46,7 +47,7 @@ class BatchNorm(linen.Module):
         x32 = x.astype(jnp.float32)
         mean, var = running_mean.value, running_var.value
         if mode.train:
-            mean, var, unbiased_var = batch_moments(x32, mode.axis_name)
+            mean, var, unbiased_var = batch_moments(x32, mode.axis_name, mask)
             if not self.is_initializing():
                 running_mean.value += self.momentum * (jax.lax.stop_gradient(mean) - running_mean.value)
                 running_var.value += self.momentum * (jax.lax.stop_gradient(unbiased_var) - running_var.value)
@@ -56,15 +57,23 @@ class BatchNorm(linen.Module):
         return y.astype(x.dtype)
 
 
-def batch_moments(x: jax.Array, axis_name: str | None) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Mean, biased and unbiased variance, each [C], of x [..., C] over all leading axes and over the mapped axis."""
+def batch_moments(x: jax.Array, axis_name: str | None,
+                  mask: jax.Array | None = None) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Mean, biased and unbiased variance, each [C], of x [..., C] over all leading axes and over the mapped axis.
+
+    With a mask [...], of the rows where it is true.
+    """
     total = lambda value: value if axis_name is None else jax.lax.psum(value, axis_name)
     axes = tuple(range(x.ndim - 1))
-    count = total(jnp.float32(math.prod(x.shape[:-1])))
-    mean = total(jnp.sum(x, axes)) / count
+    kept = None if mask is None else jnp.expand_dims(mask, -1)
+    over_rows = lambda value: total(jnp.sum(value if kept is None else jnp.where(kept, value, 0.0), axes))
+    count = total(jnp.float32(math.prod(x.shape[:-1])) if mask is None else jnp.sum(mask).astype(jnp.float32))
+    if mask is not None:
+        count = jnp.maximum(count, 1.0)
+    mean = over_rows(x) / count
     # The derivative of the squares by the mean is sum(x - mean) = 0: leaving it out saves a reduction backwards.
     centre = layers.per_channel(jax.lax.stop_gradient(mean), x.ndim)
-    squares = total(jnp.sum(jnp.square(x - centre), axes))
+    squares = over_rows(jnp.square(x - centre))
     return mean, squares / count, squares / jnp.maximum(count - 1.0, 1.0)
 
 
@@ -82,6 +91,21 @@ class LayerNorm(linen.Module):
         y = centred * jax.lax.rsqrt(jnp.mean(jnp.square(centred), axis=-1, keepdims=True) + self.epsilon)
         y = y * layers.per_channel(scale, x.ndim) + layers.per_channel(bias, x.ndim)
         return y.astype(x.dtype)
+
+
+class SampleNorm(linen.Module):
+    """[N, ..., C] normalised over everything but the first axis (torch: GroupNorm of one group), eps 1e-5."""
+
+    epsilon: float = 1e-5
+
+    @linen.compact
+    def __call__(self, x: jax.Array) -> jax.Array:
+        scale = self.param("scale", layers.shape_only, (x.shape[-1],))
+        bias = self.param("bias", layers.shape_only, (x.shape[-1],))
+        x32, axes = x.astype(jnp.float32), tuple(range(1, x.ndim))
+        centred = x32 - jnp.mean(x32, axis=axes, keepdims=True)
+        y = centred * jax.lax.rsqrt(jnp.mean(jnp.square(centred), axis=axes, keepdims=True) + self.epsilon)
+        return (y * layers.per_channel(scale, x.ndim) + layers.per_channel(bias, x.ndim)).astype(x.dtype)
 
 
 class AdaptiveInstanceNorm(linen.Module):

@@ -1,5 +1,7 @@
 """Observing, imagining and decoding: shapes, randomness, gradients, compilation."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -165,3 +167,64 @@ def test_training_windows_use_dropout_and_update_statistics(variables):
 def test_misfits_are_refused(variables, state, arguments, message):
     with pytest.raises(ValueError, match=message):
         rollout.imagine(MODEL, variables, **{"key": jax.random.key(0), "state": state} | arguments)
+
+
+@pytest.mark.parametrize("arguments, message", [
+    ({"actions_or_policy": np.full((BATCH, 3, 2), 1.5, np.float32)}, r"\[2, 3, 2\] reach from 1.5 to 1.5"),
+    ({"actions_or_policy": np.full((BATCH, 3, 2), np.nan, np.float32)}, "12 values of the actions"),
+    ({"actions_or_policy": np.zeros((BATCH, 3, 3), np.float32)}, r"got actions \[2, 3, 3\]"),
+    ({"actions_or_policy": np.zeros((BATCH, 0, 2), np.float32)}, "horizon is 0"),
+    ({"actions_or_policy": lambda key, features: features[:2], "horizon": 0}, "horizon is 0"),
+    ({"actions_or_policy": lambda key, features: features[:2], "horizon": 2, "branches": 0}, "branches is 0"),
+    ({"actions_or_policy": lambda key, features: features[:3], "horizon": 2}, r"policy returned float32\[3\]"),
+    ({"actions_or_policy": np.zeros((BATCH, 3, 2), np.float32), "state": LatentState(np.zeros((2, 16)),
+                                                                                     np.zeros((2, 9)))},
+     r"state.stochastic: got \[2, 9\], expected \[..., 8\]"),
+])
+def test_bad_input_is_refused(variables, state, arguments, message):
+    with pytest.raises(ValueError, match=message):
+        rollout.imagine(MODEL, variables, **{"key": jax.random.key(0), "state": state} | arguments)
+
+
+def test_a_dream_from_every_frame_is_the_dream_from_each(variables, actions):
+    observed = rollout.observe(MODEL, variables, jax.random.key(5), make_batch(frames=HORIZON))
+    plans = jnp.stack([actions] * HORIZON, axis=1)  # [B, T, H, 2]
+    keys = jax.random.split(jax.random.key(6), (BATCH, HORIZON))
+    dream = rollout.imagine(MODEL, variables, keys, observed.states, plans)
+    assert dream.features.shape == (BATCH, HORIZON, HORIZON, *MODEL.feature_shape)
+    close(dream[:, 1], rollout.imagine(MODEL, variables, keys[:, 1], observed.states[:, 1], actions))
+    one = rollout.imagine(MODEL, variables, keys[0, 1], observed.states[0, 1], actions[0])
+    assert one.actions.shape == (HORIZON, 2)
+
+
+def test_temperature_and_shared_noise(variables, state, actions):
+    fan = jnp.stack([actions, actions, -actions], axis=1)
+    cold = rollout.imagine(MODEL, variables, jax.random.key(1), state, fan, temperature=0.0)
+    close(cold, rollout.imagine(MODEL, variables, jax.random.key(1), state, fan, sampled=False))
+    shared = rollout.imagine(MODEL, variables, jax.random.key(1), state, fan, same_noise=True)
+    close(shared[:, 0], shared[:, 1], 0)
+    assert not np.allclose(shared.states.stochastic[:, 0], shared.states.stochastic[:, 2])
+
+
+def test_transforms_from_outside_agree(variables, state, actions):
+    dream = lambda key, state, actions: rollout.imagine(MODEL, variables, key, state, actions, sampled=False).features
+    key = jax.random.key(0)
+    want = dream(key, state, actions)
+    close(jax.jit(dream)(key, state, actions), want)
+    close(jax.vmap(dream, (None, 0, 0))(key, state, actions), want)
+    policy = lambda weight, key, features: jnp.tanh(weight @ features)
+    roll = lambda weight: rollout.imagine(MODEL, variables, key, state, jax.tree_util.Partial(policy, weight),
+                                          horizon=2).features.sum()
+    weight = jnp.full((2, *MODEL.feature_shape), 0.01)
+    assert np.abs(jax.grad(roll)(weight)).max() > 0
+
+
+def test_forward_mode_reaches_decoded_images_with_plain_convolutions(variables, state, actions):
+    plain = world_model.WorldModel(dataclasses.replace(CONFIG, convolution="xla"))
+
+    def image(scale):
+        dream = rollout.imagine(plain, variables, jax.random.key(0), state, scale * actions, sampled=False)
+        return rollout.decode(plain, variables, dream.states[:, -1], ("image",))["image"][4].sum()
+
+    _, tangent = jax.jit(lambda scale: jax.jvp(image, (scale,), (jnp.ones(()),)))(jnp.float32(0.5))
+    np.testing.assert_allclose(tangent, jax.jit(jax.grad(image))(jnp.float32(0.5)), rtol=1e-3)

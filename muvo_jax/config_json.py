@@ -1,0 +1,70 @@
+"""Frozen dataclasses from JSON and back: checked field by field, with the nearest known name in every refusal."""
+
+from __future__ import annotations
+
+import dataclasses
+import difflib
+import types
+import typing
+from typing import Any, Literal
+
+
+def check_choice(what: str, value: str, known: tuple[str, ...]) -> None:
+    """Raises ValueError where `value` is none of `known`, naming the nearest ones."""
+    if value in known:
+        return
+    near = difflib.get_close_matches(str(value), known, n=2)
+    hint = f" Did you mean {' or '.join(near)}?" if near else ""
+    raise ValueError(f"{what}: {value!r} is unknown; known are {', '.join(known)}.{hint}")
+
+
+def parse(cls, values: dict[str, Any], path: str):
+    """Builds the config dataclass `cls` from parsed JSON or TOML; `path` names the source in messages.
+
+    Raises:
+      ValueError: for an unknown field (naming the nearest known one) or a value of the wrong type.
+    """
+    if not isinstance(values, dict):
+        raise ValueError(f"{path}: got {values!r}, expected the fields of {cls.__name__}.")
+    hints = typing.get_type_hints(cls)
+    for name in values:
+        check_choice(f"{path} ({cls.__name__})", name, tuple(hints))
+    return cls(**{name: _coerce(hints[name], value, f"{path}.{name}") for name, value in values.items()})
+
+
+def override(config, dotted: str, value: Any):
+    """Returns `config` with one dotted field replaced: `override(config, "model.dropout", 0.0)`.
+
+    Raises:
+      ValueError: for an unknown field, naming the nearest known one, or a value of the wrong type.
+    """
+    values = dataclasses.asdict(config)
+    node = values
+    *parents, leaf = dotted.split(".")
+    for name in parents:
+        check_choice(f"field of {dotted!r}", name, tuple(node))
+        node = node[name]
+    check_choice(f"field of {dotted!r}", leaf, tuple(node))
+    node[leaf] = value
+    return parse(type(config), values, "config")
+
+
+def _coerce(hint, value, path: str):
+    """Returns `value` as `hint` wants it (JSON lists become tuples, whole floats stay floats), or raises."""
+    if dataclasses.is_dataclass(hint):
+        return parse(hint, value, path)
+    origin, arguments = typing.get_origin(hint), typing.get_args(hint)
+    if origin is Literal:
+        check_choice(path, value, arguments)
+        return value
+    if origin is tuple and isinstance(value, (list, tuple)):
+        inner = arguments[:1] * len(value) if arguments[-1] is Ellipsis else arguments
+        if len(inner) == len(value):
+            return tuple(_coerce(kind, item, path) for kind, item in zip(inner, value, strict=True))
+    if origin is types.UnionType and value is None and type(None) in arguments:
+        return None
+    if hint is float and isinstance(value, int) and not isinstance(value, bool):
+        return float(value)
+    if isinstance(hint, type) and isinstance(value, hint) and (hint is bool or not isinstance(value, bool)):
+        return value
+    raise ValueError(f"{path}: got {value!r}, expected {getattr(hint, '__name__', hint)}.")

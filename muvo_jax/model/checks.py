@@ -1,0 +1,94 @@
+"""Errors of imagination, raised in Python before anything is compiled; each names what came and what was expected."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from muvo_jax.model.world_model import WorldModel
+from muvo_jax.types import LatentState
+
+ACTION_CHANNELS = 2
+_ROUNDING = 1e-6
+
+
+def state(model: WorldModel, latent: LatentState) -> tuple[int, ...]:
+    """Returns the leading axes of a latent state.
+
+    Raises:
+      ValueError: if its last axes are not those of this model, or both parts have other leading axes.
+    """
+    expected = jax.tree.map(lambda leaf: leaf.shape[1:], jax.eval_shape(lambda: model.initial_state(1)))
+    leads = []
+    for name in ("deterministic", "stochastic"):
+        shape, tail = jnp.shape(getattr(latent, name)), getattr(expected, name)
+        if shape[len(shape) - len(tail):] != tail:
+            raise ValueError(f"state.{name}: got {list(shape)}, expected [{', '.join(map(str, ('...', *tail)))}]; this "
+                             f"state belongs to another model.")
+        leads.append(shape[:len(shape) - len(tail)])
+    if leads[0] != leads[1]:
+        raise ValueError(f"state: deterministic has the leading axes {list(leads[0])}, stochastic {list(leads[1])}.")
+    return leads[0]
+
+
+def actions(given, lead: tuple[int, ...], horizon: int | None, branches: int | None) -> tuple[int | None, int]:
+    """Returns (branches, horizon) as the actions imply them.
+
+    Raises:
+      ValueError: if they do not fit; for values that are concrete also where one is not finite or outside [-1, 1].
+    """
+    shape, rank = jnp.shape(given), len(lead)
+    if len(shape) not in (rank + 2, rank + 3) or shape[:rank] != lead or shape[-1] != ACTION_CHANNELS:
+        axes = "".join(f"{size}, " for size in lead)
+        raise ValueError(f"imagine: got actions {list(shape)}, expected [{axes}H, 2] or [{axes}N, H, 2].")
+    if horizon is not None and horizon != shape[-2]:
+        raise ValueError(f"imagine: horizon={horizon}, but there are {shape[-2]} actions; leave horizon out.")
+    has_branches = len(shape) == rank + 3
+    if has_branches and branches not in (None, shape[rank]):
+        raise ValueError(f"imagine: branches={branches}, but the actions have {shape[rank]}; leave branches out.")
+    action_values(given, "imagine")
+    return (shape[rank] if has_branches else branches), shape[-2]
+
+
+def action_values(given, where: str) -> None:
+    """Raises ValueError where a concrete action is not finite or outside [-1, 1]; traced values pass."""
+    if isinstance(given, jax.core.Tracer):
+        return
+    values = np.asarray(given)
+    if not np.isfinite(values).all():
+        count = np.count_nonzero(~np.isfinite(values))
+        raise ValueError(f"{where}: {count} values of the actions {list(values.shape)} are not finite.")
+    if values.size and np.abs(values).max() > 1.0 + _ROUNDING:
+        raise ValueError(f"{where}: actions {list(values.shape)} reach from {values.min():g} to {values.max():g}, "
+                         f"expected [-1, 1] (acceleration, steering; see muvo_jax.config.ActionContract).")
+
+
+def counts(horizon: int | None, branches: int | None) -> int:
+    """Returns the horizon.
+
+    Raises:
+      ValueError: if there is none, or it or the number of branches is below 1.
+    """
+    if horizon is None:
+        raise ValueError("imagine: a policy needs a horizon; pass horizon=number of steps.")
+    if horizon < 1:
+        raise ValueError(f"imagine: horizon is {horizon}; it must be at least 1.")
+    if branches is not None and branches < 1:
+        raise ValueError(f"imagine: branches is {branches}; it must be at least 1.")
+    return horizon
+
+
+def policy_action(action: jax.Array, features: jax.Array) -> jax.Array:
+    """Returns what a policy chose for [B] states, clipped to [-1, 1].
+
+    Raises:
+      ValueError: while tracing, unless it is a floating-point array [B, 2].
+    """
+    expected = (features.shape[0], ACTION_CHANNELS)
+    if not isinstance(action, jax.Array) or action.shape != expected or not jnp.issubdtype(action.dtype, jnp.floating):
+        came = f"{action.dtype}{list(action.shape[1:])}" if isinstance(action, jax.Array) else jax.tree.map(
+            lambda leaf: leaf.shape[1:], action)
+        raise ValueError(f"imagine: for features {list(features.shape[1:])} the policy returned {came}, expected a "
+                         f"float32[2] action (acceleration, steering) in [-1, 1].")
+    return jnp.clip(action.astype(jnp.float32), -1.0, 1.0)

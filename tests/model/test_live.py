@@ -1,0 +1,51 @@
+"""Filtering a stream step by step."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from muvo_jax import presets
+from muvo_jax.model import live, rollout, world_model
+from muvo_jax.types import Batch
+
+CONFIG = presets.get("tiny").model
+MODEL = world_model.WorldModel(CONFIG)
+INPUTS = ("image", "range_view", "route_map", "speed_mps")
+
+
+def make_batch(frames):
+    random = np.random.default_rng(0)
+    return Batch(
+        action=random.uniform(-1, 1, (1, frames, 2)).astype(np.float32), is_first=np.arange(frames)[None] == 0,
+        image=random.integers(0, 256, (1, frames, *CONFIG.image_size, 3), np.uint8),
+        range_view=random.uniform(-20, 20, (1, frames, 32, 64, 4)).astype(np.float32),
+        route_map=random.integers(0, 256, (1, frames, 64, 64), np.uint8),
+        speed_mps=random.uniform(0, 10, (1, frames)).astype(np.float32))
+
+
+def test_a_stream_ends_where_the_window_ends():
+    variables = jax.tree.map(jnp.asarray, MODEL.init(jax.random.key(0)))
+    batch, key = make_batch(3), jax.random.key(7)
+    observed = rollout.observe(MODEL, variables, key, batch)
+    stream = live.start_live(MODEL, key)
+    before = live._observe_step._cache_size()
+    for t in range(3):
+        seen = {name: getattr(batch, name)[:, t] for name in INPUTS}
+        stream = live.observe_step(MODEL, variables, stream, seen, batch.action[:, max(t - 1, 0)])
+        np.testing.assert_allclose(stream.latent.features, observed.states[:, t].features, atol=1e-5)
+    assert live._observe_step._cache_size() == before + 1
+    assert stream.frame.tolist() == [3]
+
+
+@pytest.mark.parametrize("action, message", [
+    (np.zeros((2, 2)), r"got previous_action \[2, 2\], expected \[1, 2\]"), ([[0, np.inf]], "not finite"),
+    ([[0, -2]], "reach from -2 to 0")])
+def test_bad_actions_are_refused(action, message):
+    with pytest.raises(ValueError, match=message):
+        live.observe_step(MODEL, {}, live.start_live(MODEL, jax.random.key(0)), {}, action)
+
+
+def test_missing_sensors_are_named():
+    with pytest.raises(ValueError, match=r"Batch\.image is None"):
+        live.observe_step(MODEL, {}, live.start_live(MODEL, jax.random.key(0)), {}, np.zeros((1, 2)))

@@ -1,0 +1,208 @@
+"""Plain recordings written in the MUVO layout, as the authors' DataWriter leaves them, for their code to read.
+
+    OUT/trainval/<mode>/<Town>/<run>/...    see carla_files.py; one run for each gap-free sequence
+    OUT/sensors.toml                        ours: where the sensors sit (the authors' code passes it over)
+    OUT/runs.csv                            mode, town, run, and the run of the source that it is
+
+The plain format knows no expert's policy, no satellite position and no bird's-eye view of other cars: those columns are
+zeros, as an autopilot leaves them, and the birdview is background throughout. Frames without a recorded reward get 1,
+lest the authors' filter drop the run. Voxels are written where the recorded grid is the authors'; else make them from
+depth and lidar afterwards. Nothing here needs pandas.
+"""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+import io
+import pathlib
+import shutil
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from PIL import Image
+
+from muvo_jax.data import carla, carla_files, files, frame_pickle, plain, recorder, schema
+
+# What the town's classes are in CARLA's tags (town/boxes.py: sky, road, marking, pavement, grass, building, ...).
+TOWN_TAGS = np.array([13, 7, 6, 8, 22, 1, 9, 5, 10, 4], np.uint8)
+_OTHER_TAG = 3
+_LAYOUT_PX = 192
+_COMMAND_FOLLOW = 4
+_BACKGROUND = 1  # bit 0
+_WEATHER = ("cloudiness", "fog_density", "fog_distance", "fog_falloff", "precipitation", "precipitation_deposits",
+            "sun_altitude_angle", "sun_azimuth_angle", "wetness", "wind_intensity")
+
+
+def export(source: pathlib.Path | str, out: pathlib.Path | str, *, town: str = "Town01",
+           progress: Callable[[int, int], None] | None = None) -> int:
+    """Writes every sequence of a plain recording as a run of the MUVO layout; complete runs that are there are kept.
+
+    Args:
+      source: a plain recording with image, depth, classes, points and route map.
+      out: folder of the new recording.
+      town: name of the towns' folder; the authors' voxel step looks for Town*.
+      progress: called with (frames done, frames in all).
+
+    Returns:
+      How many frames were written.
+
+    Raises:
+      DataError: where the source lacks what the authors' reader always opens, or a file is damaged.
+      FileExistsError: where `out` holds an export of other sensors.
+    """
+    source, out = pathlib.Path(source), pathlib.Path(out)
+    recording = plain.PlainRecording(source)
+    _check(recording, source)
+    _describe(recording.description, out)
+    runs = _plan(recording, town)
+    total, written = sum(sequence.length for _, sequence in runs), 0
+    for folder, sequence in runs:
+        target = out / carla.VERSION_FOLDER / folder
+        if not (target / carla.FRAME_FILE).is_file():
+            for _ in _write_run(recording, source, sequence, target, town):
+                written += 1
+                if progress is not None:
+                    progress(written, total)
+    table = io.StringIO(newline="")
+    rows = [(*pathlib.PurePosixPath(folder).parts, sequence.name, sequence.start) for folder, sequence in runs]
+    csv.writer(table, lineterminator="\n").writerows([("mode", "town", "run", "source", "first_frame"), *rows])
+    recorder.write_atomically(out / "runs.csv", table.getvalue())
+    return written
+
+
+def _check(recording: plain.PlainRecording, source: pathlib.Path) -> None:
+    described = recording.description
+    lacking = sorted({"image", "points_m", "route_map"} - described.modalities)
+    first = source / recording.sequences[0].name
+    lacking += [name for name in ("depth", "classes") if not (first / name).is_dir()]
+    if lacking:
+        raise schema.DataError(f"{source}: the authors' reader always opens image, depth, classes, points and route "
+                               f"map; this recording has no {', '.join(lacking)}.")
+
+
+def _describe(described: schema.RecordingDescription, out: pathlib.Path) -> None:
+    tables: dict[str, Any] = {"camera": described.camera, "lidar": described.lidar, "action": described.contract}
+    if described.voxels == carla.VOXELS:
+        tables["voxels"] = described.voxels
+    text = recorder.to_toml({"rate_hz": described.rate_hz},
+                            {name: dataclasses.asdict(value) for name, value in tables.items() if value is not None})
+    path = out / carla.SENSORS_FILE
+    if path.is_file() and path.read_text(encoding="utf-8") != text:
+        raise FileExistsError(f"{path} describes other sensors; choose another folder or remove this one.")
+    out.mkdir(parents=True, exist_ok=True)
+    recorder.write_atomically(path, text)
+
+
+def _plan(recording: plain.PlainRecording, town: str) -> list[tuple[str, schema.Sequence]]:
+    """(mode/town/run, sequence): "train" stays, the other splits become val0, val1, ... in their order."""
+    others = [split for split in recording.description.splits if split != "train"]
+    modes = {"train": "train"} | {split: f"val{index}" for index, split in enumerate(others)}
+    counts = dict.fromkeys(modes.values(), 0)
+    plan = []
+    for sequence in recording.sequences:
+        mode = modes[sequence.split]
+        plan.append((f"{mode}/{town}/{counts[mode]:04d}", sequence))
+        counts[mode] += 1
+    return plan
+
+
+def _write_run(recording: plain.PlainRecording, source: pathlib.Path, sequence: schema.Sequence, target: pathlib.Path,
+               town: str):
+    """Writes one run, the data frame last; yields after each frame."""
+    shutil.rmtree(target, ignore_errors=True)
+    for kind in (*carla_files.KINDS, "image_left", "image_right", "image_all"):
+        (target / kind).mkdir(parents=True)
+    described = recording.description
+    has_voxels = described.voxels == carla.VOXELS and "occupancy" in described.modalities
+    if not has_voxels:
+        (target / "voxel").rmdir()
+    rows = []
+    for index in range(sequence.length):
+        frame = recording.read(sequence, index)
+        _write_frame(frame, described, source / sequence.name, target, index)
+        rows.append(frame)
+        yield index
+    content = frame_pickle.frame(_columns(rows, town, has_voxels))
+    draft = target / f".{carla.FRAME_FILE}.part"
+    draft.write_bytes(content)
+    draft.replace(target / carla.FRAME_FILE)
+
+
+def _write_frame(frame: schema.RawFrame, described: schema.RecordingDescription, source: pathlib.Path,
+                 target: pathlib.Path, number: int) -> None:
+    frame_id = int(frame["frame_id"])
+    assert described.lidar is not None
+
+    def path(kind: str) -> pathlib.Path:
+        return target / carla_files.file_name(kind, number)
+
+    def save(kind: str, pixels: np.ndarray) -> None:
+        Image.fromarray(np.ascontiguousarray(pixels)).save(path(kind), compress_level=1)
+
+    save("image", frame["image"])
+    depth_m = recorder.decode_depth(files.read_image(source / "depth" / f"{frame_id:06d}.png", None))
+    classes = files.read_image(source / "classes" / f"{frame_id:06d}.png", "L")
+    tags = TOWN_TAGS[np.minimum(classes, len(TOWN_TAGS) - 1)] if described.name == "town" else classes
+    save("depth_semantic", np.concatenate([carla_files.encode_depth(depth_m), tags[..., None]], axis=-1))
+    route = frame["route_map"]
+    save("routemap", np.where(np.kron(route, np.ones((_LAYOUT_PX // route.shape[0],) * 2, np.uint8)) > 127, 255, 0)
+         .astype(np.uint8))
+    save("birdview", np.full((_LAYOUT_PX, _LAYOUT_PX), _BACKGROUND, np.uint16))
+    hit = point_tags(source / "lidar" / f"{frame_id:06d}.npz", len(frame["points_m"]))
+    path("points_semantic").write_bytes(frame_pickle.npy_of_dict(
+        {"points_xyz": to_lidar_frame(frame["points_m"], described.lidar.position_m), "ObjTag": hit}))
+    if described.voxels == carla.VOXELS and "occupancy" in frame:
+        z, y, x = np.nonzero(frame["occupancy"].transpose(2, 1, 0) == 1)
+        np.save(path("voxel"), np.stack([x, y, z, np.full(len(x), _OTHER_TAG)], axis=1).astype(np.uint16))
+
+
+def to_lidar_frame(points_m: np.ndarray, lidar_position_m: tuple[float, float, float]) -> np.ndarray:
+    """Ego frame (x forward, y left) to CARLA's lidar frame (y right), float32 [N, 3] in Fortran order."""
+    x, y, z = (np.float32(value) for value in lidar_position_m)
+    moved = points_m.astype(np.float32) * np.array([[1, -1, 1]], np.float32) - np.array([[x, -y, z]], np.float32)
+    return np.asfortranarray(moved)
+
+
+def point_tags(path: pathlib.Path, count: int) -> np.ndarray:
+    """What each point hit, uint8 [count]; "other" where the recording does not say."""
+    with np.load(path, allow_pickle=False) as arrays:
+        tags = arrays["point_tags"] if "point_tags" in arrays else np.full(count, _OTHER_TAG)
+    return tags.astype(np.uint8) if len(tags) == count else np.full(count, _OTHER_TAG, np.uint8)
+
+
+def _columns(rows: list[schema.RawFrame], town: str, has_voxels: bool) -> dict:
+    """All columns in the order of DataWriter (and generate_voxels), with its types."""
+    count = len(rows)
+
+    def cells(size: int, dtype=np.float32, value: float = 0.0) -> list[np.ndarray]:
+        return [np.full(size, value, dtype) for _ in range(count)]
+
+    def paths(kind: str) -> list[str]:
+        return [carla_files.file_name(kind, number) for number in range(count)]
+
+    def imu(row: schema.RawFrame) -> np.ndarray:
+        reading = np.zeros(7, np.float32)
+        reading[5] = -row.get("yaw_rate_radps", np.float32(0))
+        return reading
+
+    accelerations = [float(row["action"][0]) for row in rows]
+    actions = [np.array([max(value, 0.0), row["action"][1], max(-value, 0.0)], np.float32)
+               for value, row in zip(accelerations, rows, strict=True)]
+    columns: dict = {
+        "action_mu": cells(1), "action_sigma": cells(1), "action": actions,
+        "speed": [np.array([row["speed_mps"]], np.float32) for row in rows],
+        "reward": np.array([row.get("reward", 1.0) for row in rows], np.float64), "value": np.zeros(count, np.float32),
+        "features": cells(1), "gnss": cells(3), "target_gps": cells(3), "imu": [imu(row) for row in rows],
+        "command": cells(1, np.int8, _COMMAND_FOLLOW), "target_gps_next": cells(3),
+        "command_next": cells(1, np.int8, _COMMAND_FOLLOW),
+    }
+    columns |= {f"{kind}_path": paths(kind) for kind in ("image", "depth_semantic", "birdview", "routemap",
+                                                         "points_semantic")}
+    columns |= {"n_classes": np.full(count, len(carla_files.BIRDVIEW_BITS), np.int64),
+                "is_expert": np.ones(count, bool), "weather": ["ClearNoon"] * count, "town": [town] * count,
+                "n_vehicles": [[0, 0]] * count, "n_walkers": [[0, 0]] * count, "route_id": np.zeros(count, np.int64),
+                "env_id": ["Endless-v0"] * count}
+    columns |= {name: np.zeros(count, np.float64) for name in _WEATHER}
+    return columns | ({"voxel_path": paths("voxel")} if has_voxels else {})

@@ -101,9 +101,11 @@ def ssim(prediction: jax.Array, target: jax.Array, *, non_negative: bool = False
         return image
 
     mean_p, mean_t = blur(prediction), blur(target)
-    var_p = blur(prediction * prediction) - mean_p * mean_p
-    var_t = blur(target * target) - mean_t * mean_t
-    covariance = blur(prediction * target) - mean_p * mean_t
+    # Variances do not depend on an offset; about the middle of [0, 1] their differences cancel less.
+    from_p, from_t, about_p, about_t = prediction - 0.5, target - 0.5, mean_p - 0.5, mean_t - 0.5
+    var_p = blur(from_p * from_p) - about_p * about_p
+    var_t = blur(from_t * from_t) - about_t * about_t
+    covariance = blur(from_p * from_t) - about_p * about_t
     contrast = (2.0 * covariance + _SSIM_C2) / (var_p + var_t + _SSIM_C2)
     similarity = (2.0 * mean_p * mean_t + _SSIM_C1) / (mean_p ** 2 + mean_t ** 2 + _SSIM_C1) * contrast
     each = similarity.mean(axis=(1, 2))

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from muvo_jax.interop import packs, weights_rule
-from muvo_jax.interop.parity import cases, losses, modules_1d, registry, runner
+from muvo_jax.interop.parity import cases, geometry, losses, modules_1d, registry, runner
 
 SILENT = lambda line: None
 # CRC-32 of arrays that the rule must give on every machine.
@@ -133,7 +133,13 @@ def checked(name, file, groups):
 
 
 def test_losses():
-    assert checked("p1", "p1_losses_metrics.npz", losses.GROUPS).passed > 60
+    groups = (losses.divergence, losses.spatial, losses.scene_class_affinity, losses.structural_similarity,
+              losses.chamfer_metrics, losses.class_scores)
+    assert checked("p1", "p1_losses_metrics.npz", groups).passed > 60
+
+
+def test_geometry():
+    assert checked("p2", "p2_geometry.npz", geometry.GROUPS).passed == 26
 
 
 def test_modules_of_the_1d_model():
@@ -142,7 +148,8 @@ def test_modules_of_the_1d_model():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name, file", [("p3_1d", "p3_modules_1d.npz")])
-def test_whole_packs(name, file):
+@pytest.mark.parametrize("name, file, entries", [("p3_1d", "p3_modules_1d.npz", 51),
+                                                 ("p3_2d", "p3_modules_2d.npz", 73)])
+def test_whole_packs(name, file, entries):
     checks = next(checks for checks in registry.PACKS if checks.name == name)
-    assert checked(name, file, checks.groups).ok
+    assert checked(name, file, checks.groups).passed == entries

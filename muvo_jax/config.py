@@ -5,17 +5,18 @@ from __future__ import annotations
 import dataclasses
 from typing import Any, Literal
 
-from muvo_jax.config_json import check_choice, override, parse
+from muvo_jax.config_json import check_choice, override, override_all, parse
 from muvo_jax.geometry import BirdsEyeGrid, PillarGrid, RangeViewGeometry, VoxelGrid
 
 __all__ = ["ActionContract", "BirdsEyeGrid", "Config", "DataConfig", "EvaluationConfig", "LossConfig", "ModelConfig",
-           "OptimizerConfig", "PillarGrid", "RangeViewGeometry", "TrainConfig", "VoxelGrid", "override", "parse"]
+           "OptimizerConfig", "PillarGrid", "RangeViewGeometry", "TrainConfig", "VoxelGrid", "override", "override_all",
+           "parse"]
 
-FUSIONS = ("tr",)
-LIDAR_ENCODERS = ("rv",)
-CAMERA_ENCODERS = ("wob",)
+FUSIONS = ("tr", "fc", "avg")
+LIDAR_ENCODERS = ("rv", "pp")
+CAMERA_ENCODERS = ("wob", "bev")
 LATENTS = ("1d", "2d")
-BACKBONES = ("resnet18",)
+BACKBONES = ("resnet18", "mobilevitv2_100")
 HEADS = ("image", "range_view", "occupancy", "action")
 
 

@@ -6,6 +6,7 @@ import dataclasses
 import difflib
 import types
 import typing
+from collections.abc import Mapping
 from typing import Any, Literal
 
 
@@ -38,14 +39,20 @@ def override(config, dotted: str, value: Any):
     Raises:
       ValueError: for an unknown field, naming the nearest known one, or a value of the wrong type.
     """
+    return override_all(config, {dotted: value})
+
+
+def override_all(config, settings: Mapping[str, Any]):
+    """`override` with several fields at once: only the result must make sense, not each step on the way."""
     values = dataclasses.asdict(config)
-    node = values
-    *parents, leaf = dotted.split(".")
-    for name in parents:
-        check_choice(f"field of {dotted!r}", name, tuple(node))
-        node = node[name]
-    check_choice(f"field of {dotted!r}", leaf, tuple(node))
-    node[leaf] = value
+    for dotted, value in settings.items():
+        node = values
+        *parents, leaf = dotted.split(".")
+        for name in parents:
+            check_choice(f"field of {dotted!r}", name, tuple(node))
+            node = node[name]
+        check_choice(f"field of {dotted!r}", leaf, tuple(node))
+        node[leaf] = value
     return parse(type(config), values, "config")
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import difflib
 import math
 
@@ -21,7 +22,11 @@ def town() -> config_lib.Config:
         image_size=(64, 256),
         range_view=config_lib.RangeViewGeometry(rows=64, columns=128),
         voxels=config_lib.VoxelGrid(shape=(48, 48, 8), voxel_size_m=1.0, origin_m=(-24.0, -24.0, -1.5)),
+        pillars=config_lib.PillarGrid(half_side_m=24.0, cells_per_m=2.0, points=8192, channels=16),
+        birds_eye=config_lib.BirdsEyeGrid(cells=24, cell_m=1.0, cells_behind=4, depth_bins=20, lifted_bins=8,
+                                          hidden_channels=128),
         backbone_width=16,
+        map_channels=32,
         token_channels=96,
         transformer_layers=2,
         transformer_heads=4,
@@ -54,7 +59,11 @@ def tiny() -> config_lib.Config:
         image_size=(32, 64),
         range_view=config_lib.RangeViewGeometry(rows=32, columns=64),
         voxels=config_lib.VoxelGrid(shape=(16, 16, 16), voxel_size_m=2.0, origin_m=(-16.0, -16.0, -3.0)),
+        pillars=config_lib.PillarGrid(half_side_m=16.0, cells_per_m=1.0, points=1024, channels=4),
+        birds_eye=config_lib.BirdsEyeGrid(cells=8, cell_m=4.0, cells_behind=2, depth_bins=12, lifted_bins=3,
+                                          hidden_channels=8),
         backbone_width=4,
+        map_channels=8,
         token_channels=12,
         transformer_layers=1,
         transformer_heads=2,
@@ -102,7 +111,39 @@ def paper_occupancy() -> config_lib.Config:
     )
 
 
-PRESETS = {"town": town, "tiny": tiny, "paper": paper, "paper-occupancy": paper_occupancy}
+def _reference(preset: str, loss: config_lib.LossConfig, **model) -> config_lib.Config:
+    """What the authors' released models share: their numerics, lengths and schedule, over 6 observed frames."""
+    return config_lib.Config(
+        preset=preset,
+        model=config_lib.ModelConfig(numerics="reference", **model),
+        loss=dataclasses.replace(loss, occupancy_unknown="empty"),
+        optimizer=config_lib.OptimizerConfig(accumulate=16),
+        data=config_lib.DataConfig(frames=6, context=6, horizon=10, town_size="tiny"),
+        train=config_lib.TrainConfig(steps=100_000),
+    )
+
+
+def reference_1d() -> config_lib.Config:
+    """The released 1D model with occupancy, RV-WOB-TR (176 million parameters, the unused ones included)."""
+    return _reference("reference-1d", config_lib.LossConfig(), latent="1d")
+
+
+# The authors' 2D code trains occupancy by geometric affinity alone.
+_REFERENCE_2D_LOSS = config_lib.LossConfig(occupancy_cross_entropy=0.0, occupancy_semantic_scal=0.0)
+
+
+def reference_2d() -> config_lib.Config:
+    """The released 2D model, RV-WOB-TR (119 million parameters)."""
+    return _reference("reference-2d", _REFERENCE_2D_LOSS, latent="2d")
+
+
+def reference_mobilevit() -> config_lib.Config:
+    """The released 2D model whose backbones are MobileViT-V2 (114 million parameters)."""
+    return _reference("reference-mobilevit", _REFERENCE_2D_LOSS, latent="2d", backbone="mobilevitv2_100")
+
+
+PRESETS = {"town": town, "tiny": tiny, "paper": paper, "paper-occupancy": paper_occupancy,
+           "reference-1d": reference_1d, "reference-2d": reference_2d, "reference-mobilevit": reference_mobilevit}
 
 
 def get(name: str) -> config_lib.Config:

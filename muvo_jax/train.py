@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import pathlib
 import shlex
 import sys
+from collections.abc import Sequence
 from typing import Annotated, Any
 
 import numpy as np
@@ -17,7 +19,8 @@ from muvo_jax.training import loop, run_folder, screen, validation
 from muvo_jax.viz import curves, sheets
 
 # Flags that change one field of the configuration.
-_FIELDS = {"fusion": "model.fusion", "data": "data.path", "steps": "train.steps", "batch": "train.batch",
+_FIELDS = {"lidar": "model.lidar", "camera": "model.camera", "fusion": "model.fusion", "latent": "model.latent",
+           "backbone": "model.backbone", "data": "data.path", "steps": "train.steps", "batch": "train.batch",
            "accumulate": "optimizer.accumulate", "frames": "data.frames", "stride": "data.stride",
            "context": "data.context", "horizon": "data.horizon", "learning_rate": "optimizer.learning_rate",
            "seed": "train.seed", "parallel": "train.parallel"}
@@ -34,9 +37,23 @@ class Options:
 
     preset: Annotated[str | None, command_line.shown("NAME", "town")] = None
     """Named configuration: town (small), tiny (for tests), paper (camera and lidar at the paper's size),
-    paper-occupancy (with voxels)."""
-    fusion: Annotated[str | None, command_line.shown("NAME")] = None
-    """How camera and lidar are fused: tr (transformer)."""
+    paper-occupancy (with voxels), reference-1d, reference-2d, reference-mobilevit (as the authors released them)."""
+    variant: Annotated[str | None, command_line.shown("NAME")] = None
+    """The paper's name of lidar, camera and fusion, such as PP-BEV-FC."""
+    lidar: Annotated[str | None, command_line.shown("{rv,pp}")] = None
+    """How points are read: rv (range view) or pp (PointPillars)."""
+    camera: Annotated[str | None, command_line.shown("{wob,bev}")] = None
+    """How images are read: wob (as they are) or bev (lifted to a bird's-eye view)."""
+    fusion: Annotated[str | None, command_line.shown("{tr,fc,avg}")] = None
+    """How camera and lidar are fused: tr (transformer), fc (concatenation and a dense layer), avg (mean)."""
+    latent: Annotated[str | None, command_line.shown("{1d,2d}")] = None
+    """The latent state: 1d (vectors) or 2d (tokens, only with fusion tr)."""
+    backbone: Annotated[str | None, command_line.shown("{resnet18,mobilevitv2_100}")] = None
+    """Of image and range view."""
+    occupancy: tyro.conf.FlagCreatePairsOff[bool] = False
+    """Predict occupancy, whatever the preset says."""
+    no_occupancy: tyro.conf.FlagCreatePairsOff[bool] = False
+    """Predict no occupancy."""
     data: Annotated[str | None, command_line.shown("PATH")] = None
     """"town" (built in) or the folder of a recording; its kind is recognised."""
     name: Annotated[str | None, command_line.shown("NAME", "made of data, preset and fusion")] = None
@@ -73,6 +90,7 @@ class Options:
 
 EXAMPLES = """
 python -m muvo_jax.train --fusion=tr
+python -m muvo_jax.train --variant=PP-BEV-FC --no-occupancy
 python -m muvo_jax.train --preset=tiny  (does everything run?)
 python -m muvo_jax.train --data=/data/kitti_raw --name=kitti
 python -m muvo_jax.train --name=town-tr --resume --steps=800  (goes on with a run)
@@ -89,7 +107,7 @@ def configure(options: Options) -> tuple[config_lib.Config, dict[str, Any], path
       FileNotFoundError: where there is no run to resume.
     """
     chosen = {field: getattr(options, flag) for flag, field in _FIELDS.items() if getattr(options, flag) is not None}
-    chosen |= command_line.parse_settings(options.set)
+    chosen = _variant_settings(options) | chosen | command_line.parse_settings(options.set)
     base = presets.get(options.preset or "town")
     folder = options.runs_dir / (options.name or default_name(options))
     if options.resume:
@@ -97,16 +115,51 @@ def configure(options: Options) -> tuple[config_lib.Config, dict[str, Any], path
         if options.preset not in (None, base.preset):
             raise ValueError(f"run {folder} was started with preset {base.preset!r}, not {options.preset!r}: leave "
                              f"--preset away, or start another run with --name.")
-    for name, value in chosen.items():
-        base = config_lib.override(base, name, value)
+    if options.occupancy or options.no_occupancy:
+        chosen["model.heads"] = _heads(options, chosen.get("model.heads", base.model.heads))
+    if chosen.get("model.fusion", "tr") != "tr" and base.model.latent == "2d":
+        chosen.setdefault("model.latent", "1d")  # the only one that such a fusion has
+    base = config_lib.override_all(base, chosen)
     if base.data.path != "town":
         base = config_lib.override(base, "data.path", str(pathlib.Path(base.data.path).expanduser().resolve()))
     return base, chosen, folder
 
 
+def _variant_settings(options: Options) -> dict[str, str]:
+    """{"model.lidar": "pp", ...} from --variant=PP-BEV-FC.
+
+    Raises:
+      ValueError: for a name that does not exist, or another flag that contradicts it.
+    """
+    if options.variant is None:
+        return {}
+    kinds = (config_lib.LIDAR_ENCODERS, config_lib.CAMERA_ENCODERS, config_lib.FUSIONS)
+    known = ["-".join(parts).upper() for parts in itertools.product(*kinds)]
+    if options.variant.upper() not in known:
+        raise ValueError(f"--variant={options.variant} is unknown; known are {', '.join(known)}.")
+    parts = dict(zip(("lidar", "camera", "fusion"), options.variant.lower().split("-"), strict=True))
+    for flag, value in parts.items():
+        if getattr(options, flag) not in (None, value):
+            raise ValueError(f"--variant={options.variant} and --{flag}={getattr(options, flag)} contradict "
+                             f"each other: give one of them.")
+    return {f"model.{flag}": value for flag, value in parts.items()}
+
+
+def _heads(options: Options, heads: Sequence[str]) -> tuple[str, ...]:
+    """The heads with or without occupancy, as the flags say."""
+    if options.occupancy and options.no_occupancy:
+        raise ValueError("--occupancy and --no-occupancy contradict each other: give one of them.")
+    wanted = {*heads, "occupancy"} if options.occupancy else set(heads) - {"occupancy"}
+    return tuple(head for head in config_lib.HEADS if head in wanted)
+
+
 def default_name(options: Options) -> str:
-    """Such as town-tr, tiny-tr or kitti_raw-tr."""
-    parts = [options.preset or "town", options.fusion or "tr"]
+    """Such as town-tr, tiny-pp-bev-fc or kitti_raw-tr-2d."""
+    settings = _variant_settings(options)
+    lidar, camera, fusion = (getattr(options, flag) or settings.get(f"model.{flag}", usual)
+                             for flag, usual in (("lidar", "rv"), ("camera", "wob"), ("fusion", "tr")))
+    parts = [options.preset or "town", fusion if (lidar, camera) == ("rv", "wob") else f"{lidar}-{camera}-{fusion}"]
+    parts += [choice for choice in (options.latent, options.backbone) if choice]
     if options.data not in (None, "town"):
         parts = [pathlib.Path(options.data).resolve().name] + (parts if options.preset else parts[1:])
     return "-".join(parts)

@@ -89,9 +89,8 @@ class Batch(_Indexable):
 
     def time_slice(self, start: int, stop: int) -> Batch:
         """The same windows, restricted to frames start..stop-1; calibration has no time axis and stays."""
-        untimed = ("intrinsics", "camera_to_ego")
         timed = {name: value[:, start:stop] for name, value in vars(self).items()
-                 if value is not None and name not in untimed}
+                 if value is not None and name not in UNTIMED_FIELDS}
         return dataclasses.replace(self, **timed)
 
     def validate(self) -> Batch:
@@ -100,21 +99,22 @@ class Batch(_Indexable):
         Raises:
           ValueError: naming the field, what came and what was expected.
         """
-        for name, (dtype, rank) in _BATCH_FIELDS.items():
+        for name, (dtype, rank) in BATCH_FIELDS.items():
             value = getattr(self, name)
             if value is None:
                 continue
             if value.dtype != dtype or value.ndim != rank:
                 raise ValueError(f"Batch.{name}: got {value.dtype}{list(value.shape)}, expected {np.dtype(dtype).name} "
                                  f"with {rank} axes (see muvo_jax.types.Batch).")
-            prefix = 1 if name in ("intrinsics", "camera_to_ego") else 2
+            prefix = 1 if name in UNTIMED_FIELDS else 2
             if value.shape[:prefix] != self.action.shape[:prefix]:
                 raise ValueError(f"Batch.{name}: leading axes {value.shape[:prefix]} differ from those of action, "
                                  f"{self.action.shape[:prefix]}.")
         return self
 
 
-_BATCH_FIELDS = {
+UNTIMED_FIELDS = ("intrinsics", "camera_to_ego")  # one for each window
+BATCH_FIELDS = {  # dtype, rank
     "action": (np.float32, 3), "is_first": (np.bool_, 2), "image": (np.uint8, 5), "range_view": (np.float32, 5),
     "points": (np.float32, 4), "point_count": (np.int32, 2), "command": (np.int32, 2), "next_command": (np.int32, 2),
     "target_m": (np.float32, 3), "next_target_m": (np.float32, 3), "occupancy": (np.uint8, 5),

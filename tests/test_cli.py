@@ -53,8 +53,13 @@ def test_an_unknown_option_names_its_neighbours(capsys):
 
 
 @pytest.mark.parametrize(("arguments", "message"), [
-    (["--preset=towm"], "preset 'towm' is unknown; known are town, tiny, paper, paper-occupancy. Did you mean town?"),
+    (["--preset=towm"], "preset 'towm' is unknown; known are town, tiny, paper, paper-occupancy, "
+     "reference-1d, reference-2d, reference-mobilevit. Did you mean town?"),
     (["--fusion=tt"], "model.fusion: 'tt' is unknown; known are tr"),
+    (["--variant=PP-FC"], "--variant=PP-FC is unknown; known are RV-WOB-TR"),
+    (["--variant=PP-BEV-FC", "--lidar=rv"], "--variant=PP-BEV-FC and --lidar=rv contradict each other"),
+    (["--fusion=avg", "--latent=2d"], "the 2D latent is made of tokens, and only tr keeps tokens"),
+    (["--occupancy", "--no-occupancy"], "contradict each other"),
     (["--set", "model.dropot=0"], "'dropot' is unknown"),
     (["--set", "model.dropout"], "expected name=value"),
     (["--set", "train.steps=many"], "train.steps: got 'many', expected int"),
@@ -96,8 +101,19 @@ def test_a_flag_beats_the_preset_and_set_reaches_everything():
 def test_default_names_tell_runs_apart():
     names = [train.default_name(options) for options in (
         train.Options(), train.Options(preset="paper", fusion="tr"), train.Options(data="/data/kitti_raw"),
-        train.Options(data="/data/kitti_raw/", preset="tiny"))]
-    assert names == ["town-tr", "paper-tr", "kitti_raw-tr", "kitti_raw-tiny-tr"]
+        train.Options(data="/data/kitti_raw/", preset="tiny"), train.Options(variant="PP-BEV-FC"),
+        train.Options(lidar="pp", latent="2d"))]
+    assert names == ["town-tr", "paper-tr", "kitti_raw-tr", "kitti_raw-tiny-tr", "town-pp-bev-fc", "town-pp-wob-tr-2d"]
+
+
+def test_variant_flags_choose_encoders_fusion_latent_and_heads():
+    model = train.configure(train.Options(preset="tiny", variant="pp-bev-fc", no_occupancy=True))[0].model
+    assert (model.variant, model.latent) == ("PP-BEV-FC", "1d")
+    assert model.heads == ("image", "range_view", "action")
+    model = train.configure(train.Options(preset="paper", occupancy=True, backbone="mobilevitv2_100"))[0].model
+    assert (model.heads, model.backbone) == (config_lib.HEADS, "mobilevitv2_100")
+    model = train.configure(train.Options(preset="reference-2d", fusion="avg"))[0].model
+    assert (model.variant, model.latent) == ("RV-WOB-AVG", "1d")
 
 
 def test_resume_takes_the_settings_of_the_run_and_refuses_another_preset(tmp_path):

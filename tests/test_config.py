@@ -35,12 +35,17 @@ def test_override_changes_one_field_and_leaves_the_rest():
     ("model.image_size", [64, 100], "must be multiples of 32"),
     ("model.transformer_heads", 7, "multiple of 4 and of model.transformer_heads 7"),
     ("model.occupancy_blocks", 9, "each side must be a multiple of 4096"),
+    ("model.pillars.cells_per_m", 1.0, "model.pillars has 48 cells on a side"),
+    ("model.birds_eye.lifted_bins", 99, "lifted_bins 99 lie between 1 and depth_bins"),
+    ("model.image_size", [32, 256], "multiples of 64"),
     ("data.stride", 0, "data.stride is 0; it must be at least 1"),
     ("train.parallel", "pmapp", "Did you mean pmap"),
 ])
 def test_bad_values_are_refused_with_the_reason(field, value, message):
+    town = config_lib.override_all(presets.get("town"), {
+        "model.lidar": "pp", "model.camera": "bev", "model.backbone": "mobilevitv2_100"})
     with pytest.raises(ValueError, match=message):
-        config_lib.override(presets.get("town"), field, value)
+        config_lib.override(town, field, value)
 
 
 def test_unknown_preset_names_its_neighbour():

@@ -22,6 +22,7 @@ ALLOWED = {
     "model": BASE | {"nn"},
     "objectives": BASE | {"nn", "model"},
     "metrics": BASE | {"nn", "model"},
+    "agents": BASE | {"nn", "model", "metrics"},
     "data": BASE,
     "viz": BASE,
     "interop": BASE | {"nn", "model", "objectives", "metrics", "data", "training", "command_line"},

@@ -13,6 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from muvo_jax import config as config_lib
 from muvo_jax import presets, types
 from muvo_jax.data.town import settings
 from muvo_jax.data.town.simulator import Town
@@ -97,11 +98,45 @@ def chamfer_of_pixels(frame: dict[str, np.ndarray]) -> tuple[str, str]:
     return f"{float(np.asarray(returns).squeeze()):.3f}", f"{pixels:.3f}"
 
 
+def posterior_memory() -> tuple[str, str]:
+    """Mean change of the posterior's means where the mark of the state's tokens moves by N(0, 0.5), 2D town model."""
+    changes = []
+    for numerics in ("standard", "reference"):
+        config = dataclasses.replace(presets.get("town").model, latent="2d", numerics=numerics)
+        model = world_model.WorldModel(config)
+        params = model.init(jax.random.key(0))["params"]
+        mark = 0.5 * jax.random.normal(jax.random.key(1), (config.token_channels,))
+        embedding = jax.random.normal(jax.random.key(2), (4, 50, config.token_channels))
+        zeros = model.initial_state(4).stochastic
+        noise = types.StepNoise(zeros, zeros, jnp.zeros((4,), bool))
+
+        def means(table, model=model, params=params, embedding=embedding, noise=noise):
+            moved = {**params, "transition": {**params["transition"], "type_embedding": table}}
+            return model.observe_step({"params": moved}, noise, jnp.ones((4, 2)), model.initial_state(4), embedding,
+                                      jnp.zeros((4,), bool))[1][1].mean
+
+        table = jnp.asarray(params["transition"]["type_embedding"])
+        changes.append(f"{float(jnp.abs(jax.jit(means)(table.at[1].add(mark)) - jax.jit(means)(table)).mean()):.4f}")
+    return changes[0], changes[1]
+
+
+def decoder_parameters() -> tuple[str, str]:
+    """Parameters of the 2D model's decoders at the paper's size."""
+    counts = []
+    for numerics in ("standard", "reference"):
+        shapes = world_model.WorldModel(config_lib.ModelConfig(latent="2d", numerics=numerics)).variable_shapes()
+        decoders = [shape for name, shape in shapes["params"].items() if name.startswith("decoders_")]
+        counts.append(f"{sum(leaf.size for leaf in jax.tree.leaves(decoders)):,}")
+    return counts[0], counts[1]
+
+
 def rows() -> list[tuple[str, tuple[str, str]]]:
     """(what was measured, (here, reference))."""
     frame = town_frame()
     return [
         ("mean size of the prior's means after 6 imagined steps, fresh town model", leaky_slope()),
+        ("change of the posterior's means with the mark of the state's tokens, 2D town model", posterior_memory()),
+        ("parameters of the 2D decoders at the paper's size", decoder_parameters()),
         ("KL of random Gaussians, 6 frames", first_step_kl(6)),
         ("KL of random Gaussians, 12 frames", first_step_kl(12)),
         ("share of steps in which 8 windows toss the same coin", prior_dropout_coin()),

@@ -8,6 +8,7 @@ field of view and mounting; occupancy is the recorded one or, where none is reco
 from __future__ import annotations
 
 import dataclasses
+import warnings
 from collections.abc import Collection
 from typing import NamedTuple
 
@@ -23,6 +24,7 @@ SHORT_RECORDING_FRAMES = 100
 # What a short recording is cut into: 0.4 s observed and 0.4 s imagined at 10 Hz.
 _SHORT = {"stride": 1, "context": 4, "horizon": 4, "frames": 8}
 _SIDE_MULTIPLE = 32
+NAVIGATION = ("command", "next_command", "target_m", "next_target_m")
 
 PreparedFrame = dict[str, np.ndarray | np.generic]  # names and dtypes of types.Batch without B and T
 
@@ -76,7 +78,12 @@ def prepare_frame(raw: schema.RawFrame, config: config_lib.Config) -> PreparedFr
             ready["occupancy"] = _occupancy(raw, model)
     except ValueError as error:
         raise schema.DataError(f"frame {int(raw['frame_id'])}: {error}") from error
+    if model.lidar == "pp":
+        ready["points"], ready["point_count"] = _padded_points(raw["points_m"], model.pillars.points,
+                                                               int(raw["frame_id"]))
     ready["camera_to_ego"] = raw["camera_to_ego"]
+    if model.navigation:
+        ready |= {name: raw[name] for name in NAVIGATION}  # type: ignore[literal-required]
     if model.route:
         ready["route_map"] = raw["route_map"]
     if model.speed:
@@ -85,6 +92,20 @@ def prepare_frame(raw: schema.RawFrame, config: config_lib.Config) -> PreparedFr
         if name in raw:
             ready[name] = raw[name]
     return ready
+
+
+def _padded_points(points_m: np.ndarray, rows: int, seed: int) -> tuple[np.ndarray, np.int32]:
+    """Exactly `rows` points, zeros behind the last one, and how many are real.
+
+    Of a longer scan a random subset stays, the same one each time: its first points would be one side of the world.
+    """
+    if len(points_m) > rows:
+        warnings.warn(f"scans with more than model.pillars.points={rows} points are thinned to a random subset of that "
+                      f"size.", schema.DataWarning, stacklevel=2)
+        points_m = points_m[np.random.default_rng(seed).choice(len(points_m), rows, replace=False)]
+    padded = np.zeros((rows, 3), np.float32)
+    padded[:len(points_m)] = points_m
+    return padded, np.int32(len(points_m))
 
 
 def _occupancy(raw: schema.RawFrame, model: config_lib.ModelConfig) -> np.ndarray:
@@ -122,6 +143,9 @@ def _fit_model(model: config_lib.ModelConfig, description: schema.RecordingDescr
     if model.speed and "speed_mps" not in description.modalities:
         changes["speed"] = False
         notes.append("no speed is recorded: the model has no speed input.")
+    if model.navigation and not description.modalities.issuperset(NAVIGATION):
+        changes["navigation"] = False
+        notes.append("no navigation commands are recorded: the model has no such input.")
     if changes["image_size"] != model.image_size:
         notes.append(f"images of {camera.width_px}x{camera.height_px} pixels become {changes['image_size'][1]}x"
                      f"{changes['image_size'][0]}: scaled by width, rows cut off at the top.")

@@ -34,6 +34,7 @@ class RawFrame(TypedDict, total=False):
       route_map: uint8 [64, 64].
       action: float32 [2], applied from this frame to the next.
       speed_mps, reward, is_terminal, timestamp_s: scalars.
+      command, next_command: int32 scalars, 0 to 5; target_m, next_target_m: float32 [2] (muvo_jax.types.Batch).
       yaw_rate_radps: measured, left positive; for checks, no model sees it.
       frame_id: the recording's own number.
     """
@@ -46,6 +47,10 @@ class RawFrame(TypedDict, total=False):
     route_map: np.ndarray
     speed_mps: np.float32
     yaw_rate_radps: np.float32
+    command: np.int32
+    next_command: np.int32
+    target_m: np.ndarray
+    next_target_m: np.ndarray
     action: np.ndarray
     reward: np.float32
     is_terminal: np.bool_

@@ -101,10 +101,9 @@ def recognise(stored: Stored) -> config_lib.ModelConfig:
 
 def published_name(model: config_lib.ModelConfig) -> str | None:
     """The released file that a model of exactly this architecture is, None for others."""
-    backbone = getattr(model, "backbone", "resnet18")
     released = dataclasses.replace(config_lib.ModelConfig(), numerics="reference", latent=model.latent,
-                                   heads=model.heads, **({"backbone": backbone} if backbone != "resnet18" else {}))
-    return _PUBLISHED.get((model.latent, "occupancy" in model.heads, backbone)) if model == released else None
+                                   heads=model.heads, backbone=model.backbone)
+    return _PUBLISHED.get((model.latent, "occupancy" in model.heads, model.backbone)) if model == released else None
 
 
 def _describe(state_dict: Mapping[str, np.ndarray]) -> config_lib.ModelConfig:

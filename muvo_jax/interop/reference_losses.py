@@ -116,8 +116,10 @@ def feature_distance(features: list[jax.Array], targets: list[jax.Array], *, nor
     """Sum over levels of the mean squared ("l2") or absolute ("l1") difference of maps, and of their Gram matrices."""
     measure = {"l1": jnp.abs, "l2": jnp.square}[norm]
     pairs = list(zip(features, targets, strict=True))
-    total = sum(measure(ours - theirs).mean() for ours, theirs in pairs)
-    return total + sum(jnp.square(_gram(ours) - _gram(theirs)).mean() for ours, theirs in pairs) if style else total
+    total = jnp.stack([measure(ours - theirs).mean() for ours, theirs in pairs]).sum()
+    if style:
+        total += jnp.stack([jnp.square(_gram(ours) - _gram(theirs)).mean() for ours, theirs in pairs]).sum()
+    return total
 
 
 def _gram(maps: jax.Array) -> jax.Array:

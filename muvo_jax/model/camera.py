@@ -1,6 +1,12 @@
-"""Camera encoders: image -> map of tokens. WOB (without bird's eye view, paper Table I) keeps the image plane."""
+"""Camera encoders: image -> map of features.
+
+WOB (without bird's-eye view, paper Table I) keeps the image plane, BEV lifts it to the ground ahead. Both end in
+token_channels for fusion "tr", and otherwise in map_channels.
+"""
 
 from __future__ import annotations
+
+from collections.abc import Mapping
 
 import jax
 import jax.numpy as jnp
@@ -8,10 +14,13 @@ from flax import linen
 
 from muvo_jax.config import ModelConfig
 from muvo_jax.model import common
-from muvo_jax.nn import norm, pyramid, resnet
+from muvo_jax.nn import layers, norm, pyramid
+from muvo_jax.ops import frustum
 
 IMAGENET_MEAN = (0.485, 0.456, 0.406)
 IMAGENET_STD = (0.229, 0.224, 0.225)
+LEVELS = (2, 3, 4)
+_FINEST_STRIDE = 8  # of level 2
 
 
 def normalise_image(image: jax.Array) -> jax.Array:
@@ -22,16 +31,58 @@ def normalise_image(image: jax.Array) -> jax.Array:
 
 
 class PlaneCamera(linen.Module):
-    """WOB: image uint8 [N, H, W, 3] -> [N, H/32, W/32, token_channels]."""
+    """WOB: [N, H/32, W/32, C], or /8 for fusions without tokens and with many of them."""
 
     config: ModelConfig
 
+    @staticmethod
+    def inputs(config: ModelConfig) -> dict[str, tuple[int, ...]]:
+        """Name of a Batch field -> its shape for one frame."""
+        return {"image": (*config.image_size, 3)}
+
     @linen.compact
-    def __call__(self, image: jax.Array, mode: norm.Mode) -> jax.Array:
+    def __call__(self, frames: Mapping[str, jax.Array], mode: norm.Mode) -> jax.Array:
         compute = common.compute(self.config)
-        maps = resnet.ResNet18(self.config.backbone_width, (2, 3, 4), compute, name="backbone")(
-            normalise_image(image).astype(compute.dtype), mode)
-        return pyramid.DownsamplingPyramid(self.config.token_channels, compute, name="neck")(maps, mode)
+        image = normalise_image(frames["image"]).astype(compute.dtype)
+        maps = common.backbone(self.config, LEVELS, name="backbone")(image, mode)
+        return common.neck(self.config, name="neck")(maps, mode)
 
 
-REGISTRY = {"wob": PlaneCamera}
+class BirdsEyeCamera(linen.Module):
+    """BEV: lift and splat; [N, cells/4, cells/4, C], or [N, cells, cells, C] without tokens and with many of them.
+
+    Rows grow to the right, columns forward. Differs from the reference where its rays and cells are half a cell off:
+    it spreads the rays from the first to the last pixel and rounds towards zero (numerics="reference").
+    """
+
+    config: ModelConfig
+
+    @staticmethod
+    def inputs(config: ModelConfig) -> dict[str, tuple[int, ...]]:
+        """Name of a Batch field -> its shape for one frame."""
+        return {"image": (*config.image_size, 3), "intrinsics": (3, 3), "camera_to_ego": (4, 4)}
+
+    @linen.compact
+    def __call__(self, frames: Mapping[str, jax.Array], mode: norm.Mode) -> jax.Array:
+        config, grid, compute = self.config, self.config.birds_eye, common.compute(self.config)
+        image = normalise_image(frames["image"]).astype(compute.dtype)
+        maps = common.backbone(config, LEVELS, name="backbone")(image, mode)
+        channels = common.map_channels(config)
+        features = pyramid.UpsamplingPyramid(channels, compute, name="neck")(maps, mode)
+        logits = layers.Dense(grid.depth_bins, compute, name="depth")(
+            pyramid.UpsamplingPyramid(channels, compute, name="depth_neck")(maps, mode))
+        probabilities = jnp.moveaxis(jax.nn.softmax(logits.astype(jnp.float32), axis=-1), -1, 1)
+        (count, rows, columns), bins = features.shape[:3], grid.depth_bins
+        quirks = config.numerics == "reference"
+        points_m = frustum.frustum_points(frames["intrinsics"], frames["camera_to_ego"], (rows, columns),
+                                          _FINEST_STRIDE, bins, corners=quirks)
+        cells = frustum.cell_indices(points_m, grid, truncate=quirks).reshape(count, bins, rows * columns)
+        chosen = frustum.most_probable(probabilities.reshape(cells.shape), cells, grid.lifted_bins)
+        lifted = frustum.lift_splat(features.reshape(count, -1, channels), *chosen, grid)
+        if config.fusion != "tr" or config.many_tokens:
+            return lifted
+        x = jax.nn.relu(layers.Conv(grid.hidden_channels, (5, 5), compute, 2, name="shrink0")(lifted))
+        return layers.Conv(channels, (5, 5), compute, 2, name="shrink1")(x)
+
+
+REGISTRY: dict[str, type[PlaneCamera] | type[BirdsEyeCamera]] = {"wob": PlaneCamera, "bev": BirdsEyeCamera}

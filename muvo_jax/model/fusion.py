@@ -12,15 +12,17 @@ from muvo_jax.nn import attention, layers, norm, resnet
 
 
 class Compression(linen.Module):
-    """[N, H, W, C] -> [N, features]: a halving block, a block, the mean over the map."""
+    """[N, H, W, C] -> [N, features]: a halving block, a block (which halves too where `halvings` is 2), the mean."""
 
     features: int
     compute: layers.Compute = layers.Compute()
+    halvings: int = 1
 
     @linen.compact
     def __call__(self, x: jax.Array, mode: norm.Mode) -> jax.Array:
         x = resnet.BasicBlock(self.features, self.compute, stride=2, project=True, name="block0")(x, mode)
-        x = resnet.BasicBlock(self.features, self.compute, name="block1")(x, mode)
+        twice = self.halvings == 2
+        x = resnet.BasicBlock(self.features, self.compute, 2 if twice else 1, twice, name="block1")(x, mode)
         return jnp.mean(x, axis=(1, 2))
 
 
@@ -61,4 +63,49 @@ class TransformerFusion(linen.Module):
         return layers.Dense(config.embedding_channels, compute, name="combine")(joined).astype(jnp.float32)
 
 
-REGISTRY = {"tr": TransformerFusion}
+class PooledFusion(linen.Module):
+    """What FC and AVG have in common: each sensor's map becomes one vector.
+
+    The measurements [N, measurement_channels] are spread over the image map [N, h, w, map_channels], which goes through
+    three levels of a ResNet-18 before it is compressed; the lidar map is compressed as it is. Result: [N,
+    embedding_channels].
+    """
+
+    config: ModelConfig
+
+    def vectors(self, image_map: jax.Array, lidar_map: jax.Array, measurements: list[jax.Array], mode: norm.Mode,
+                features: int) -> tuple[jax.Array, jax.Array]:
+        """The two vectors [N, features]; to be called in a compact method."""
+        config, compute = self.config, common.compute(self.config)
+        spread = [jnp.broadcast_to(value[:, None, None], (*image_map.shape[:3], value.shape[-1]))
+                  for value in measurements]
+        joined = jnp.concatenate([image_map, *spread], axis=-1)
+        (deep,) = resnet.ResNet18(config.backbone_width, (3,), compute, name="map_backbone")(joined, mode)
+        return (Compression(features, compute, name="image_state")(deep, mode),
+                Compression(features, compute, halvings=2, name="lidar_state")(lidar_map, mode))
+
+
+class ConcatenationFusion(PooledFusion):
+    """FC: both vectors side by side, then a dense layer."""
+
+    @linen.compact
+    def __call__(self, image_map: jax.Array, lidar_map: jax.Array, measurements: list[jax.Array], mode: norm.Mode,
+                 keys: jax.Array | None) -> jax.Array:
+        del keys
+        both = self.vectors(image_map, lidar_map, measurements, mode, self.config.fused_channels)
+        join = layers.Dense(self.config.embedding_channels, common.compute(self.config), name="join")
+        return join(jnp.concatenate(both, axis=-1)).astype(jnp.float32)
+
+
+class AverageFusion(PooledFusion):
+    """AVG: the mean of both vectors (the paper says so; in the reference's code the line is commented out)."""
+
+    @linen.compact
+    def __call__(self, image_map: jax.Array, lidar_map: jax.Array, measurements: list[jax.Array], mode: norm.Mode,
+                 keys: jax.Array | None) -> jax.Array:
+        del keys
+        image, lidar = self.vectors(image_map, lidar_map, measurements, mode, self.config.embedding_channels)
+        return 0.5 * (image.astype(jnp.float32) + lidar.astype(jnp.float32))
+
+
+REGISTRY: dict[str, type[linen.Module]] = {"tr": TransformerFusion, "fc": ConcatenationFusion, "avg": AverageFusion}

@@ -1,27 +1,83 @@
-"""Lidar encoders: points -> map of tokens. RV (paper Table I) reads the range view as a four-channel image."""
+"""Lidar encoders: points -> map of features.
+
+RV (paper Table I) reads the range view as a four-channel image, PP the points themselves as pillars on the ground. Both
+end in token_channels for fusion "tr", and otherwise in map_channels.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import jax
+import jax.numpy as jnp
 from flax import linen
 
 from muvo_jax.config import ModelConfig
 from muvo_jax.model import common
-from muvo_jax.nn import norm, pyramid, resnet
+from muvo_jax.nn import layers, norm, resnet
+from muvo_jax.ops import pillars
 
 
 class RangeViewLidar(linen.Module):
-    """Range view float32 [N, Hr, Wr, 4] in metres -> [N, Hr/32, Wr/32, token_channels]; for the 2D latent /16."""
+    """RV: [N, Hr/32, Wr/32, C]; for the 2D latent /16; /8 for fusions without tokens and with many of them (2D: /4)."""
+
+    config: ModelConfig
+
+    @staticmethod
+    def inputs(config: ModelConfig) -> dict[str, tuple[int, ...]]:
+        """Name of a Batch field -> its shape for one frame."""
+        return {"range_view": (config.range_view.rows, config.range_view.columns, 4)}
+
+    @linen.compact
+    def __call__(self, frames: Mapping[str, jax.Array], mode: norm.Mode) -> jax.Array:
+        compute = common.compute(self.config)
+        scaled = (frames["range_view"] / self.config.range_scale_m).astype(compute.dtype)
+        levels = (1, 2, 3) if self.config.latent == "2d" else (2, 3, 4)
+        maps = common.backbone(self.config, levels, name="backbone")(scaled, mode)
+        return common.neck(self.config, name="neck")(maps, mode)
+
+
+class PillarNet(linen.Module):
+    """Points [N, P, 3] -> [N, cells, cells, channels]: two dense layers for each point, their maximum in each pillar.
+
+    BatchNorm's moments are those of the points inside the grid. Differs from the reference where that measures a point
+    from the cell's corner, with x and y mixed up (numerics="reference").
+    """
 
     config: ModelConfig
 
     @linen.compact
-    def __call__(self, range_view: jax.Array, mode: norm.Mode) -> jax.Array:
-        compute = common.compute(self.config)
-        scaled = (range_view / self.config.range_scale_m).astype(compute.dtype)
-        levels = (1, 2, 3) if self.config.latent == "2d" else (2, 3, 4)
-        maps = resnet.ResNet18(self.config.backbone_width, levels, compute, name="backbone")(scaled, mode)
-        return pyramid.DownsamplingPyramid(self.config.token_channels, compute, name="neck")(maps, mode)
+    def __call__(self, points_m: jax.Array, count: jax.Array, mode: norm.Mode) -> jax.Array:
+        grid, compute = self.config.pillars, common.compute(self.config)
+        index, cell = pillars.pillar_indices(points_m, count, grid)
+        x = pillars.decorate(points_m, index, cell, grid, swapped_corners=self.config.numerics == "reference")
+        inside = index < points_m.shape[0] * grid.cells**2
+        for layer in range(2):
+            x = layers.Dense(grid.channels, compute, name=f"linear{layer}")(x)
+            x = jax.nn.relu(norm.BatchNorm(name=f"norm{layer}")(x, mode, inside))
+        return pillars.canvas(x, index, grid)
 
 
-REGISTRY = {"rv": RangeViewLidar}
+class PillarLidar(linen.Module):
+    """PP: [N, cells/32, cells/32, C]; /8 for fusions without tokens and with many of them.
+
+    Rows grow backward, columns to the left.
+    """
+
+    config: ModelConfig
+
+    @staticmethod
+    def inputs(config: ModelConfig) -> dict[str, tuple[int, ...]]:
+        """Name of a Batch field -> its shape for one frame."""
+        return {"points": (config.pillars.points, 3), "point_count": ()}
+
+    @linen.compact
+    def __call__(self, frames: Mapping[str, jax.Array], mode: norm.Mode) -> jax.Array:
+        points_m = jnp.asarray(frames["points"], jnp.float32)
+        canvas = PillarNet(self.config, name="pillars")(points_m, frames["point_count"], mode)
+        maps = resnet.ResNet18(self.config.backbone_width, (2, 3, 4), common.compute(self.config),
+                               name="pillar_backbone")(canvas, mode)
+        return common.neck(self.config, name="pillar_neck")(maps, mode)
+
+
+REGISTRY: dict[str, type[RangeViewLidar] | type[PillarLidar]] = {"rv": RangeViewLidar, "pp": PillarLidar}

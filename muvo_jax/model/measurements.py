@@ -1,4 +1,4 @@
-"""Encoders of the inputs that are not sensors' views: the planned route and the speed."""
+"""Encoders of the inputs that are not sensors' views: the planned route, the speed and what the navigation says."""
 
 from __future__ import annotations
 
@@ -9,6 +9,8 @@ from flax import linen
 from muvo_jax.config import ModelConfig
 from muvo_jax.model import camera, common
 from muvo_jax.nn import layers, norm, resnet
+
+COMMANDS = 6
 
 
 class RouteEncoder(linen.Module):
@@ -35,3 +37,29 @@ class SpeedEncoder(linen.Module):
         scaled = jnp.expand_dims(speed_mps / self.config.speed_scale_mps, -1)
         widths = (self.config.measurement_channels, common.measurement_channels(self.config))
         return jax.nn.relu(layers.Mlp(widths, common.compute(self.config), name="mlp")(scaled))
+
+
+class CommandEncoder(linen.Module):
+    """A navigation command int32 [N], 0 to 5 -> [N, common.measurement_channels]."""
+
+    config: ModelConfig
+
+    @linen.compact
+    def __call__(self, command: jax.Array) -> jax.Array:
+        channels = self.config.measurement_channels // 2
+        embedding = self.param("embedding", layers.shape_only, (COMMANDS, channels))
+        out = channels if self.config.latent == "1d" else common.measurement_channels(self.config)
+        return jax.nn.relu(layers.Mlp((channels, out), common.compute(self.config), name="mlp")(
+            jnp.take(embedding, command, axis=0)))
+
+
+class TargetEncoder(linen.Module):
+    """The places of both commands, float32 [N, 2] each, m -> [N, common.measurement_channels]."""
+
+    config: ModelConfig
+
+    @linen.compact
+    def __call__(self, target_m: jax.Array, next_target_m: jax.Array) -> jax.Array:
+        widths = (self.config.measurement_channels, common.measurement_channels(self.config))
+        both = jnp.concatenate([target_m, next_target_m], axis=-1)
+        return jax.nn.relu(layers.Mlp(widths, common.compute(self.config), name="mlp")(both))

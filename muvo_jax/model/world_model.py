@@ -22,7 +22,7 @@ from muvo_jax.config import ModelConfig
 from muvo_jax.model import camera, fusion, heads, lidar, measurements, tokens, transition
 from muvo_jax.nn import init as init_lib
 from muvo_jax.nn import norm
-from muvo_jax.types import Batch, Gaussian, LatentState, Predictions, StepNoise, Variables
+from muvo_jax.types import BATCH_FIELDS, UNTIMED_FIELDS, Batch, Gaussian, LatentState, Predictions, StepNoise, Variables
 
 ROUTE_MAP_SIZE = (64, 64)
 
@@ -38,6 +38,10 @@ class Network(linen.Module):
         self.lidar = lidar.REGISTRY[config.lidar](config)
         if config.route:
             self.route = measurements.RouteEncoder(config)
+        if config.navigation:
+            self.command = measurements.CommandEncoder(config)
+            self.next_command = measurements.CommandEncoder(config)
+            self.target = measurements.TargetEncoder(config)
         if config.speed:
             self.speed = measurements.SpeedEncoder(config)
         self.fusion = fusion.REGISTRY[config.fusion](config)
@@ -49,10 +53,12 @@ class Network(linen.Module):
         measured = []
         if self.config.route:
             measured.append(self.route(frames["route_map"], mode))
+        if self.config.navigation:
+            measured += [self.command(frames["command"]), self.next_command(frames["next_command"]),
+                         self.target(frames["target_m"], frames["next_target_m"])]
         if self.config.speed:
             measured.append(self.speed(frames["speed_mps"]))
-        return self.fusion(self.camera(frames["image"], mode), self.lidar(frames["range_view"], mode), measured, mode,
-                           keys)
+        return self.fusion(self.camera(frames, mode), self.lidar(frames, mode), measured, mode, keys)
 
     def observe_step(self, *args):
         return self.transition.observe_step(*args)
@@ -222,24 +228,32 @@ class WorldModel:
     def _frames(self, batch: Batch) -> dict[str, Any]:
         """The model's inputs with batch and time merged, [B * T, ...], after checking their sizes."""
         config = self.config
-        expected: dict[str, tuple[int, ...]] = {
-            "image": (*config.image_size, 3),
-            "range_view": (config.range_view.rows, config.range_view.columns, 4)}
-        if config.route:
-            expected["route_map"] = ROUTE_MAP_SIZE
-        if config.speed:
-            expected["speed_mps"] = ()
         frames = {}
-        for name, shape in expected.items():
+        for name, shape in inputs(config).items():
             value = getattr(batch, name)
             if value is None:
                 raise ValueError(f"Batch.{name} is None, but the model reads it; switch it off in the configuration of "
                                  f"the model or give it.")
-            if value.shape[2:] != shape:
+            lead = ("B",) if name in UNTIMED_FIELDS else ("B", "T")
+            if value.shape[len(lead):] != shape:
                 raise ValueError(f"Batch.{name}: got {list(value.shape)}, expected "
-                                 f"[{', '.join(map(str, ('B', 'T', *shape)))}] as the model's configuration says.")
+                                 f"[{', '.join(map(str, (*lead, *shape)))}] as the model's configuration says.")
+            if name in UNTIMED_FIELDS:
+                value = jnp.broadcast_to(jnp.asarray(value)[:, None], (*batch.action.shape[:2], *shape))
             frames[name] = jnp.reshape(value, (-1, *shape))
         return frames
+
+
+def inputs(config: ModelConfig) -> dict[str, tuple[int, ...]]:
+    """What a model reads: name of a Batch field -> its shape for one frame."""
+    fields = {**camera.REGISTRY[config.camera].inputs(config), **lidar.REGISTRY[config.lidar].inputs(config)}
+    if config.route:
+        fields["route_map"] = ROUTE_MAP_SIZE
+    if config.navigation:
+        fields |= {"command": (), "next_command": (), "target_m": (2,), "next_target_m": (2,)}
+    if config.speed:
+        fields["speed_mps"] = ()
+    return fields
 
 
 def _in_units(value: jax.Array, name: str, config: ModelConfig) -> jax.Array:
@@ -250,11 +264,7 @@ def _in_units(value: jax.Array, name: str, config: ModelConfig) -> jax.Array:
 @functools.lru_cache(maxsize=8)
 def _variable_shapes(network: Network) -> dict[str, Any]:
     config = network.config
-    range_size = (config.range_view.rows, config.range_view.columns)
-    frames = {"image": jax.ShapeDtypeStruct((1, *config.image_size, 3), jnp.uint8),
-              "range_view": jax.ShapeDtypeStruct((1, *range_size, 4), jnp.float32),
-              "route_map": jax.ShapeDtypeStruct((1, *ROUTE_MAP_SIZE), jnp.uint8),
-              "speed_mps": jax.ShapeDtypeStruct((1,), jnp.float32)}
+    frames = {name: jax.ShapeDtypeStruct((1, *shape), BATCH_FIELDS[name][0]) for name, shape in inputs(config).items()}
     state = WorldModel(config).initial_state(1)
     noise = StepNoise(state.stochastic, state.stochastic, jnp.zeros((1,), jnp.bool_))
     action = jax.ShapeDtypeStruct((1, 2), jnp.float32)

@@ -7,6 +7,7 @@ over devices.
 
 from __future__ import annotations
 
+import functools
 import math
 
 import jax
@@ -43,7 +44,7 @@ def sine_positions(size: tuple[int, ...], channels: int) -> np.ndarray:
     return np.concatenate(encoded, axis=-1).reshape(-1, channels).astype(np.float32)
 
 
-def dropout(x: jax.Array, keys: jax.Array | None, site: int, rate: float) -> jax.Array:
+def dropout(x: jax.Array, keys: jax.Array | None, site: int | jax.Array, rate: float) -> jax.Array:
     """Zeroes entries of x [N, ...] with probability `rate` and scales the rest by 1 / (1 - rate).
 
     Args:
@@ -87,7 +88,7 @@ class Attention(linen.Module):
     compute: layers.Compute = layers.Compute()
 
     @linen.compact
-    def __call__(self, x: jax.Array, memory: jax.Array, keys: jax.Array | None, site: int) -> jax.Array:
+    def __call__(self, x: jax.Array, memory: jax.Array, keys: jax.Array | None, site: int | jax.Array) -> jax.Array:
         count, length, channels = x.shape
         head_channels = channels // self.heads
         query, key, value = (part.reshape(count, -1, self.heads, head_channels)
@@ -145,15 +146,15 @@ class DecoderLayer(linen.Module):
     heads: int
     hidden_channels: int
     dropout_rate: float
-    first_site: int
     compute: layers.Compute = layers.Compute()
 
     @linen.compact
-    def __call__(self, x: jax.Array, memory: jax.Array, keys: jax.Array | None) -> jax.Array:
-        drop = lambda value, offset: dropout(value, keys, self.first_site + offset, self.dropout_rate)
+    def __call__(self, x: jax.Array, memory: jax.Array, keys: jax.Array | None,
+                 first_site: int | jax.Array) -> jax.Array:
+        drop = lambda value, offset: dropout(value, keys, first_site + offset, self.dropout_rate)
         attend = lambda name: Attention(self.heads, self.dropout_rate, self.compute, name=name)
-        x = norm.LayerNorm(name="norm1")(x + drop(attend("self_attn")(x, x, keys, self.first_site), 1))
-        x = norm.LayerNorm(name="norm2")(x + drop(attend("cross_attn")(x, memory, keys, self.first_site + 2), 3))
+        x = norm.LayerNorm(name="norm1")(x + drop(attend("self_attn")(x, x, keys, first_site), 1))
+        x = norm.LayerNorm(name="norm2")(x + drop(attend("cross_attn")(x, memory, keys, first_site + 2), 3))
         hidden = jax.nn.relu(layers.Dense(self.hidden_channels, self.compute, name="linear1")(x))
         out = layers.Dense(x.shape[-1], self.compute, name="linear2")(drop(hidden, 4))
         return norm.LayerNorm(name="norm3")(x + drop(out, 5))
@@ -166,7 +167,9 @@ class TransformerDecoder(linen.Module):
     """A stack of decoder layers over tokens x [N, L, C] and a memory [N, M, C], no mask and no final norm.
 
     The backward pass computes each layer anew: the weights of a layer at the paper's size, [N, 8, 1093, 1612], with
-    their dropout, would otherwise be kept for every layer and time step.
+    their dropout, would otherwise be kept for every layer and time step. The loop is a scan, because the CPU compiler
+    moves what a plain loop computes anew to the front, all layers at once. Its stack of parameters is made on the way:
+    a tree of stacked ones would turn biases into matrices, which weight decay tells apart.
     """
 
     layers_count: int
@@ -178,8 +181,19 @@ class TransformerDecoder(linen.Module):
     @linen.compact
     def __call__(self, x: jax.Array, memory: jax.Array, keys: jax.Array | None = None,
                  first_site: int = 0) -> jax.Array:
-        layer = linen.remat(DecoderLayer)
-        for index in range(self.layers_count):
-            x = layer(self.heads, self.hidden_channels, self.dropout_rate, first_site + SITES_PER_DECODER_LAYER * index,
-                      self.compute, name=f"layer{index}")(x, memory, keys)
-        return x
+        layer = functools.partial(DecoderLayer, self.heads, self.hidden_channels, self.dropout_rate, self.compute)
+        names = [f"layer{index}" for index in range(self.layers_count)]
+        if self.is_initializing():
+            for name in names:
+                x = layer(name=name)(x, memory, keys, first_site)
+            return x
+
+        @jax.checkpoint
+        def step(x, inputs):
+            params, site = inputs
+            return layer(parent=None).apply({"params": params}, x, memory, keys, site), None
+
+        params = self.variables["params"]
+        stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *(params[name] for name in names))
+        sites = first_site + SITES_PER_DECODER_LAYER * jnp.arange(self.layers_count)
+        return jax.lax.scan(step, x, (stacked, sites))[0]

@@ -84,6 +84,21 @@ class Conv(linen.Module):
         return y
 
 
+class DepthwiseConv(linen.Module):
+    """Correlation of each channel with a kernel of its own, [*K, 1, C]: [N, H, W, C] -> [N, H/stride, W/stride, C]."""
+
+    size: int
+    compute: Compute = Compute()
+    stride: int = 1
+
+    @linen.compact
+    def __call__(self, x: jax.Array) -> jax.Array:
+        kernel = self.param("kernel", shape_only, (self.size, self.size, 1, x.shape[-1]))
+        return conv_ops.depthwise_conv(x.astype(self.compute.dtype), kernel.astype(self.compute.dtype),
+                                       stride=self.stride, padding=self.size // 2,
+                                       implementation=self.compute.convolution)
+
+
 class ConvTranspose(linen.Module):
     """Transposed convolution, kernel [*K, I, features]: an axis of stride s and size n becomes s * n.
 

@@ -1,4 +1,4 @@
-"""Brings the maps of a feature pyramid together at the coarsest size."""
+"""Brings the maps of a feature pyramid together at the coarsest or at the finest size."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from flax import linen
 
 from muvo_jax.nn import layers, norm
 from muvo_jax.ops import conv as conv_ops
+from muvo_jax.ops import resample
 
 
 class ConvNormRelu(linen.Module):
@@ -37,4 +38,22 @@ class DownsamplingPyramid(linen.Module):
             ratio = x.shape[2] // finer.shape[2]
             pooled = conv_ops.max_pool(x, window=ratio, stride=ratio)
             x = ConvNormRelu(self.features, self.compute, name=f"level{index}")(finer, mode) + pooled
+        return x
+
+
+class UpsamplingPyramid(linen.Module):
+    """[N, Hl, Wl, Cl], finest first, each half as large as the one before -> [N, H, W, features] at the finest size.
+
+    Starts from the coarsest map; at each finer level the sum so far is enlarged and the level's map is added.
+    """
+
+    features: int
+    compute: layers.Compute = layers.Compute()
+
+    @linen.compact
+    def __call__(self, maps: list[jax.Array], mode: norm.Mode) -> jax.Array:
+        x = ConvNormRelu(self.features, self.compute, name="coarsest")(maps[-1], mode)
+        for index, finer in enumerate(reversed(maps[:-1])):
+            larger = resample.upsample_linear(x, finer.shape[2] // x.shape[2])
+            x = ConvNormRelu(self.features, self.compute, name=f"finer{index}")(finer, mode) + larger
         return x

@@ -56,6 +56,40 @@ def conv(x, kernel, *, stride: PerAxis = 1, padding: PerAxis = 0, implementation
     return _cpu_conv(x, kernel, strides, pairs)
 
 
+def depthwise_conv(x, kernel, *, stride: int = 1, padding: int = 0, implementation: Implementation = "auto"):
+    """Convolution of each channel c alone: out[i, c] = sum over k of x[i * stride - padding + k, c] * kernel[k, 0, c].
+
+    On a CPU a sum of shifted products, whose gradients XLA fuses; its grouped convolution is slow there.
+
+    Args:
+      x: float [N, H, W, C].
+      kernel: float [K, K, 1, C], of the dtype of x.
+      stride, padding, implementation: as in `conv`, the same for both axes.
+
+    Returns:
+      [N, H', W', C] of the dtype of x.
+
+    Raises:
+      ValueError: for another rank, or other channels or dtypes than x has.
+    """
+    if x.ndim != 4 or kernel.ndim != 4 or kernel.shape[2:] != (1, x.shape[-1]) or kernel.dtype != x.dtype:
+        raise ValueError(f"depthwise_conv: got x {x.dtype}{list(x.shape)} and kernel {kernel.dtype}"
+                         f"{list(kernel.shape)}, expected [N, H, W, C] and [K, K, 1, C] of one dtype.")
+    if implementation == "xla" or not _use_cpu_forms(implementation):
+        return lax.conv_general_dilated(x, kernel, (stride, stride), [(padding, padding)] * 2,
+                                        dimension_numbers=("NHWC", "HWIO", "NHWC"), feature_group_count=x.shape[-1])
+    rows, columns = ((side + 2 * padding - taps) // stride + 1
+                     for side, taps in zip(x.shape[1:3], kernel.shape[:2], strict=True))
+    padded = jnp.pad(x, ((0, 0), (padding, padding), (padding, padding), (0, 0)))
+    total = jnp.zeros((x.shape[0], rows, columns, x.shape[-1]), x.dtype)
+    for row in range(kernel.shape[0]):
+        for column in range(kernel.shape[1]):
+            part = lax.slice(padded, (0, row, column, 0), (x.shape[0], row + (rows - 1) * stride + 1,
+                             column + (columns - 1) * stride + 1, x.shape[-1]), (1, stride, stride, 1))
+            total = total + part * kernel[row, column].reshape(1, 1, 1, -1)
+    return total
+
+
 def conv_transpose(x, kernel, *, stride: PerAxis = 1, padding: PerAxis = 0, output_padding: PerAxis = 0,
                    implementation: Implementation = "auto"):
     """Transposed convolution as torch has it: out[i * stride - padding + k] += x[i] @ kernel[k].

@@ -134,7 +134,7 @@ def test_imagining_a_batch_is_imagining_each_alone(variables, state):
     assert not np.allclose(whole.states.stochastic[0, -1], whole.states.stochastic[1, -1], atol=1e-2)
 
 
-def test_branches_policies_and_heads_work_as_with_vectors(variables, state):
+def test_branches_and_policies_work_as_with_vectors(variables, state):
     steer = lambda key, features: jnp.tanh(MODEL.policy_features(features)[:2])
     dream = rollout.imagine(MODEL, variables, jax.random.key(2), state, steer, horizon=2, branches=2)
     first = jnp.tanh(MODEL.policy_features(state.features)[:, :2])
@@ -142,14 +142,18 @@ def test_branches_policies_and_heads_work_as_with_vectors(variables, state):
     assert not np.allclose(dream.features[:, 0], dream.features[:, 1])
     cloned = rollout.imagine(MODEL, variables, jax.random.key(2), state, rollout.learned_policy(MODEL, variables),
                              horizon=2)
-    predictions = rollout.decode(MODEL, variables, state)
-    np.testing.assert_allclose(cloned.actions[:, 0], predictions["action"][1], atol=1e-6)
+    decoded = rollout.decode(MODEL, variables, state, ("action",))["action"][1]
+    np.testing.assert_allclose(cloned.actions[:, 0], decoded, atol=1e-6)
+    with pytest.raises(ValueError, match=r"got features \[3, 24\], expected \[..., 19, 24\] for the 2d latent"):
+        MODEL.decode(variables, jnp.ones((3, 24)))
+
+
+def test_every_head_at_its_full_size(variables, state):
+    predictions = jax.eval_shape(lambda: MODEL.decode(variables, state.features))
     view = (CONFIG.range_view.rows, CONFIG.range_view.columns, 4)
     assert predictions["range_view"][1].shape == (BATCH, *view)
     assert predictions["image"][2].shape == (BATCH, *(side // 2 for side in CONFIG.image_size), 3)
     assert predictions["occupancy"][4].shape == (BATCH, *(side // 4 for side in CONFIG.voxels.shape), 2)
-    with pytest.raises(ValueError, match=r"got features \[3, 24\], expected \[..., 19, 24\] for the 2d latent"):
-        MODEL.decode(variables, jnp.ones((3, 24)))
 
 
 def test_gradients_reach_actions_and_the_start_state(variables, state):

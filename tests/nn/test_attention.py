@@ -83,10 +83,10 @@ def decoder_and_params():
 
 
 def test_decoder_layer_by_hand():
-    layer = attention.DecoderLayer(1, 16, 0.0, 0)
+    layer = attention.DecoderLayer(1, 16, 0.0)
     draw = lambda seed, length: np.asarray(jax.random.normal(jax.random.key(seed), (1, length, 8)))
     x, memory = draw(2, 3), draw(3, 4)
-    shapes = jax.eval_shape(layer.init, jax.random.key(0), x, memory, None)
+    shapes = jax.eval_shape(lambda key: layer.init(key, x, memory, None, 0), jax.random.key(0))
     params = init.fill(shapes, jax.random.key(1))["params"]
     dense = lambda value, name: value @ params[name]["kernel"] + params[name]["bias"]
     normalise = lambda value: (value - value.mean(-1, keepdims=True)) / np.sqrt(value.var(-1, keepdims=True) + 1e-5)
@@ -100,7 +100,7 @@ def test_decoder_layer_by_hand():
     y = normalise(x[0] + attend("self_attn", x[0], x[0]))
     y = normalise(y + attend("cross_attn", y, memory[0]))
     y = normalise(y + dense(np.maximum(dense(y, "linear1"), 0), "linear2"))
-    np.testing.assert_allclose(layer.apply({"params": params}, x, memory, None)[0], y, rtol=1e-4, atol=1e-5)
+    np.testing.assert_allclose(layer.apply({"params": params}, x, memory, None, 0)[0], y, rtol=1e-4, atol=1e-5)
 
 
 def test_decoder_reads_its_memory_as_a_set():

@@ -55,8 +55,7 @@ def checks(context: cases.Context) -> Checks:
 def _entries(context: cases.Context, config: config_lib.ModelConfig) -> Iterator[tuple[str, Any]]:
     frames, later = context.pack.shape("embedding")[1], context.settings.size("p4", "imagine")
     raw = raw_batch.draw_raw(context, frames, later)
-    for name, value in reference_preprocess.network_inputs(raw).items():
-        yield f"in/{name}", value
+    yield from ((f"in/{name}", value) for name, value in reference_preprocess.network_inputs(raw).items())
     batch = raw_batch.model_batch(raw)
     model = world_model.WorldModel(config)
     variables = jax.tree.map(jnp.asarray, drawing.draw_variables(model.variable_shapes()))

@@ -193,7 +193,7 @@ def structural_similarity(context: cases.Context) -> Checks:
         return reference_losses.ssim(flat(prediction), flat(target), non_negative=non_negative)
 
     yield from _loss("ssim", similarity, prediction, target)
-    yield from _loss("ssim_nonneg", lambda *images: similarity(*images, non_negative=True), prediction, target)
+    yield from _loss("ssim_nonneg", lambda prediction, target: similarity(prediction, target, True), prediction, target)
     window = np.broadcast_to(reference_losses.ssim_window(), (3, 1, 11, 11))
     yield cases.Check("ssim_window", window, LOSS_TOLERANCE)
     both = (similarity(prediction, target) + similarity(np.float32(0.9) * target, target)) / 2
@@ -249,7 +249,7 @@ def perceptual_network(shape: tuple[int, ...]) -> tuple[resnet.ResNet18, Any]:
     return network, drawing.draw_variables(shapes, "perceptual_loss.model.")
 
 
-def perceptual_maps(network: resnet.ResNet18, weights: Any, picture: jax.Array) -> list[jax.Array]:
+def perceptual_maps(network: resnet.ResNet18, weights: Any, picture: jax.Array) -> Any:
     """Maps of pictures [B, S, 3, H, W] in [0, 1]."""
     flat = _last(picture).reshape(-1, *picture.shape[3:], 3)
     mean, std = (jnp.asarray(value, jnp.float32).reshape(1, 1, 1, 3)

@@ -1,0 +1,201 @@
+"""An actor-critic that learns in imagination alone, after DreamerV3 (Hafner et al. 2023), small enough to read.
+
+Every update imagines `horizon` steps from a batch of start states under the actor, computes lambda returns from the
+critic, and moves both: the critic towards the returns, the actor along the score function, with the returns' spread
+(percentiles 5 to 95) as scale and entropy as bonus. Differs from DreamerV3: the critic regresses symlog returns by
+squared error, not by two-hot classes, and the world model stays frozen.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from typing import Any
+
+import flax.struct
+import jax
+import jax.numpy as jnp
+import optax
+from flax import linen
+
+from muvo_jax.agents import environment as environment_lib
+from muvo_jax.types import Array
+
+
+@dataclasses.dataclass(frozen=True)
+class ActorCriticConfig:
+    """Settings; the names are those of the field.
+
+    Attributes:
+      starts, horizon: imagined drives per update and their steps.
+      width, layers: of both perceptrons.
+      target_rate: of the exponential average that gives bootstrap values.
+    """
+
+    starts: int = 64
+    horizon: int = 12
+    width: int = 128
+    layers: int = 2
+    discount: float = 0.98
+    lambda_: float = 0.95
+    entropy: float = 3e-3
+    learning_rate: float = 3e-4
+    clip_norm: float = 100.0
+    target_rate: float = 0.02
+    scale_rate: float = 0.01
+
+
+@flax.struct.dataclass
+class Learner:
+    """All that learns: parameters of actor and critic, the critic's slow copy, the returns' scale, the optimiser."""
+
+    actor: Any
+    critic: Any
+    slow_critic: Any
+    scale: Array
+    opt_state: Any
+    step: Array
+
+
+class Perceptron(linen.Module):
+    """[..., F] -> [..., outputs]: dense layers with RMS norm and SiLU, the last one starting at zero."""
+
+    width: int
+    layers: int
+    outputs: int
+
+    @linen.compact
+    def __call__(self, x: Array) -> Array:
+        for _ in range(self.layers):
+            x = linen.silu(linen.RMSNorm()(linen.Dense(self.width)(x)))
+        return linen.Dense(self.outputs, kernel_init=linen.initializers.zeros)(x)
+
+
+def symlog(x: Array) -> Array:
+    """sign(x) log(1 + |x|)."""
+    return jnp.sign(x) * jnp.log1p(jnp.abs(x))
+
+
+def symexp(x: Array) -> Array:
+    """The inverse of symlog."""
+    return jnp.sign(x) * jnp.expm1(jnp.abs(x))
+
+
+def lambda_returns(reward: Array, discount: Array, value: Array, lambda_: float) -> Array:
+    """R_t = r_t + g_t ((1 - lambda) v_t+1 + lambda R_t+1), the last one bootstrapped from the last value.
+
+    Args:
+      reward, discount: [H, ...] of each step; a discount of 0 ends the drive.
+      value: [H, ...] of the state AFTER each step.
+      lambda_: in [0, 1].
+
+    Returns:
+      [H, ...].
+    """
+    def step(following, inputs):
+        reward, discount, value = inputs
+        here = reward + discount * ((1.0 - lambda_) * value + lambda_ * following)
+        return here, here
+
+    _, returns = jax.lax.scan(step, value[-1], (reward, discount, value), reverse=True)
+    return returns
+
+
+def _actor(config):
+    return Perceptron(config.width, config.layers, 2 * environment_lib.ACTION_CHANNELS)
+
+
+def _critic(config):
+    return Perceptron(config.width, config.layers, 1)
+
+
+def _moments(config, actor, observation):
+    """Mean and standard deviation of the Gaussian whose tanh is the action."""
+    mean, raw = jnp.split(_actor(config).apply(actor, observation), 2, axis=-1)
+    return mean, 0.1 + 0.9 * jax.nn.sigmoid(raw)
+
+
+def _log_probability(mean, std, drawn):
+    """Of tanh(drawn), the constant left out: the Gaussian's minus the logarithm of tanh's slope."""
+    normal = -0.5 * ((drawn - mean) / std) ** 2 - jnp.log(std)
+    return (normal - 2.0 * (jnp.log(2.0) - drawn - jax.nn.softplus(-2.0 * drawn))).sum(axis=-1)
+
+
+def _value(config, critic, observation):
+    return symexp(_critic(config).apply(critic, observation)[..., 0])
+
+
+def policy(config: ActorCriticConfig, actor: Any, *, sampled: bool = True) -> jax.tree_util.Partial:
+    """The actor as policy(key, observation) -> action for `environment.play`; its mode unless sampled."""
+    return jax.tree_util.Partial(functools.partial(_act, config, sampled), actor)
+
+
+def _act(config, sampled, actor, key, observation):
+    mean, std = _moments(config, actor, observation)
+    return jnp.tanh(mean + std * jax.random.normal(key, mean.shape) if sampled else mean)
+
+
+def init(key: Array, environment: environment_lib.Environment, config: ActorCriticConfig) -> Learner:
+    """A fresh learner for observations that are one vector."""
+    key_actor, key_critic = jax.random.split(key)
+    observation = jnp.zeros((environment.model.policy_feature_channels,))
+    actor, critic = _actor(config).init(key_actor, observation), _critic(config).init(key_critic, observation)
+    return Learner(actor, critic, critic, jnp.float32(1.0), _optimizer(config).init((actor, critic)), jnp.int32(0))
+
+
+def _optimizer(config):
+    return optax.chain(optax.clip_by_global_norm(config.clip_norm), optax.adam(config.learning_rate))
+
+
+def imagine(environment, config, params, key, actor):
+    """Drives under the actor: observations [H + 1, N, F], pre-tanh actions [H, N, 2], transitions [H, N, ...]."""
+    key_reset, key_play = jax.random.split(key)
+    observation, state = jax.vmap(environment.reset, (0, None))(jax.random.split(key_reset, config.starts), params)
+
+    def step(carry, key):
+        observation, state = carry
+        key_action, key_step = jax.random.split(key)
+        mean, std = _moments(config, actor, observation)
+        drawn = mean + std * jax.random.normal(key_action, mean.shape)
+        keys = jax.random.split(key_step, config.starts)
+        state, transition = jax.vmap(environment.step, (0, 0, 0, None))(keys, state, jnp.tanh(drawn), params)
+        return (transition.observation, state), (observation, drawn, transition)
+
+    (last, _), (seen, drawn, transitions) = jax.lax.scan(step, (observation, state),
+                                                         jax.random.split(key_play, config.horizon))
+    return jnp.concatenate([seen, last[None]]), drawn, transitions
+
+
+@functools.partial(jax.jit, static_argnames=("environment", "config"))
+def update(environment: environment_lib.Environment, config: ActorCriticConfig, params: environment_lib.EnvParams,
+           key: Array, learner: Learner) -> tuple[Learner, dict[str, Array]]:
+    """One update; metrics: "return" and "reward" (means), "entropy", "critic_loss", "actor_loss", "terminated"."""
+    seen, drawn, transitions = jax.lax.stop_gradient(imagine(environment, config, params, key, learner.actor))
+    discount = config.discount * (1.0 - transitions.terminated.astype(jnp.float32))
+    slow = _value(config, learner.slow_critic, seen)
+    returns = lambda_returns(transitions.reward, discount, slow[1:], config.lambda_)
+    # Steps after a predicted collision do not count.
+    alive = jnp.cumprod(1.0 - transitions.terminated.astype(jnp.float32), axis=0)
+    weight = jnp.concatenate([jnp.ones_like(alive[:1]), alive[:-1]])
+    spread = jnp.percentile(returns, 95) - jnp.percentile(returns, 5)
+    scale = (1.0 - config.scale_rate) * learner.scale + config.scale_rate * spread
+    advantage = (returns - _value(config, learner.critic, seen[:-1])) / jnp.maximum(scale, 1.0)
+
+    def loss(networks):
+        actor, critic = networks
+        mean, std = _moments(config, actor, seen[:-1])
+        entropy = jnp.log(std).sum(axis=-1)
+        actor_loss = -(weight * (jax.lax.stop_gradient(advantage) * _log_probability(mean, std, drawn)
+                                 + config.entropy * entropy)).mean()
+        predicted = _critic(config).apply(critic, seen[:-1])[..., 0]
+        critic_loss = (weight * (predicted - symlog(returns)) ** 2).mean()
+        return actor_loss + critic_loss, {"actor_loss": actor_loss, "critic_loss": critic_loss,
+                                          "entropy": entropy.mean()}
+
+    gradients, metrics = jax.grad(loss, has_aux=True)((learner.actor, learner.critic))
+    updates, opt_state = _optimizer(config).update(gradients, learner.opt_state)
+    actor, critic = optax.apply_updates((learner.actor, learner.critic), updates)
+    slow_critic = optax.incremental_update(critic, learner.slow_critic, config.target_rate)
+    metrics |= {"return": returns[0].mean(), "reward": transitions.reward.mean(),
+                "terminated": transitions.terminated.mean()}
+    return Learner(actor, critic, slow_critic, scale, opt_state, learner.step + 1), metrics

@@ -1,0 +1,284 @@
+"""Imagination as an environment: the one core behind all doors. Pure functions over pytrees, no library of others.
+
+An episode starts in a latent state of a bank that was filled from a recording, and goes on in imagination. At its
+horizon it is truncated: the world does not end there, so bootstrap from the final observation. It terminates only where
+the reward function says so (by default: at a predicted collision).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from collections.abc import Callable
+from typing import Any, Literal
+
+import flax.struct
+import jax
+import jax.numpy as jnp
+
+from muvo_jax import config as config_lib
+from muvo_jax.agents import kinematics, rewards
+from muvo_jax.model import checks
+from muvo_jax.model.world_model import WorldModel
+from muvo_jax.types import Array, Batch, LatentState, Observed, Variables
+
+ACTION_CHANNELS = checks.ACTION_CHANNELS
+RewardFunction = Callable[[rewards.Moment], tuple[Array, Array, dict[str, Array]]]
+
+
+@flax.struct.dataclass
+class StartBank:
+    """Where imagined drives start: M moments of a recording.
+
+    Attributes:
+      latent: LatentState [M, ...], filtered.
+      speed_mps: float32 [M].
+      route_map: uint8 [M, 64, 64], or None.
+    """
+
+    latent: LatentState
+    speed_mps: Array
+    route_map: Array | None = None
+
+    @property
+    def size(self) -> int:
+        return self.speed_mps.shape[0]
+
+
+@flax.struct.dataclass
+class EnvParams:
+    """Everything that may change without compiling anew.
+
+    Attributes:
+      variables: of the world model.
+      bank: start states.
+      max_steps_in_episode: int32, the horizon at which an episode is truncated.
+      temperature: factor on the latent noise; 0 makes the world deterministic.
+    """
+
+    variables: Variables
+    bank: StartBank
+    max_steps_in_episode: Array
+    temperature: Array
+
+
+@flax.struct.dataclass
+class EnvState:
+    """A moment of an episode.
+
+    Attributes:
+      latent: LatentState [...].
+      motion: the car in the ego frame of the start.
+      start: int32, index into the bank.
+      time: int32, steps since the start.
+      reward, terminated: float32 and bool, of the step that led here; 0 and false at the start.
+    """
+
+    latent: LatentState
+    motion: kinematics.Motion
+    start: Array
+    time: Array
+    reward: Array
+    terminated: Array
+
+
+@flax.struct.dataclass
+class Transition:
+    """What a step gives beside the next state: observation of that state, reward, the two ends, and the reward's terms.
+
+    `terminated` and `truncated` are bool and may both be true; `final` is either.
+    """
+
+    observation: Any
+    reward: Array
+    terminated: Array
+    truncated: Array
+    terms: dict[str, Array]
+
+    @property
+    def final(self) -> Array:
+        return self.terminated | self.truncated
+
+
+@dataclasses.dataclass(frozen=True)
+class Environment:
+    """Hashable description of the environment; one car, no batch axis: use jax.vmap.
+
+    Attributes:
+      model: the world model.
+      contract: what actions mean.
+      periods: recorded periods in a model step (config.data.stride).
+      reward_config: of the driving reward.
+      reward_function: instead of it, (Moment) -> (reward, terminated, terms); `reward_heads` are decoded for it.
+      reward_heads: heads that the reward reads.
+      observation: "features" (one vector, model.policy_features) or names of heads, decoded at full size.
+    """
+
+    model: WorldModel
+    contract: config_lib.ActionContract = config_lib.ActionContract()
+    periods: int = 1
+    reward_config: rewards.RewardConfig = rewards.RewardConfig()
+    reward_function: RewardFunction | None = None
+    reward_heads: tuple[str, ...] | None = None
+    observation: Literal["features"] | tuple[str, ...] = "features"
+
+    def __post_init__(self):
+        heads = self.decoded_heads
+        missing = [head for head in heads if head not in self.model.config.heads]
+        if missing:
+            raise ValueError(f"Environment: reward or observation read the head {', '.join(missing)}, but this run "
+                             f"trained {', '.join(self.model.config.heads)}; for a reward without occupancy pass "
+                             f"reward_config=RewardConfig(collision=0.0).")
+        if self.contract.kinematics != "bicycle" and self.reward_function is None:
+            raise ValueError(f"Environment: the driving reward needs the ego path, and contract.kinematics is "
+                             f"{self.contract.kinematics!r}; pass a reward_function of your own.")
+
+    @property
+    def step_s(self) -> float:
+        """Seconds of one step."""
+        return self.periods / self.contract.rate_hz
+
+    @property
+    def decoded_heads(self) -> tuple[str, ...]:
+        """What every step decodes."""
+        wanted = () if self.observation == "features" else tuple(self.observation)
+        return tuple(dict.fromkeys((*wanted, *self._reward_heads)))
+
+    @property
+    def _reward_heads(self) -> tuple[str, ...]:
+        if self.reward_heads is not None:
+            return self.reward_heads
+        return ("occupancy",) if self.reward_function is None and self.reward_config.collision else ()
+
+    @property
+    def observation_shapes(self) -> Any:
+        """jax.ShapeDtypeStruct of an observation: one, or a dict of them by head."""
+        features = jax.ShapeDtypeStruct(self.model.feature_shape, jnp.float32)
+        variables = self.model.variable_shapes()
+        return jax.eval_shape(lambda variables, features: self._observe(features, self._decode(variables, features)[0]),
+                              variables, features)
+
+    def params(self, variables: Variables, bank: StartBank, horizon: int, temperature: float = 1.0) -> EnvParams:
+        """Checks and packs what the environment runs on.
+
+        Raises:
+          ValueError: for a bank of another model, an empty one, or a horizon below 1.
+        """
+        lead = checks.state(self.model, bank.latent)
+        if len(lead) != 1 or bank.size < 1 or lead != bank.speed_mps.shape:
+            raise ValueError(f"StartBank: got states {list(lead)} and speeds {list(bank.speed_mps.shape)}; expected "
+                             f"both [M] with M at least 1.")
+        checks.counts(horizon, None)
+        return EnvParams(jax.tree.map(jnp.asarray, variables), bank, jnp.int32(horizon), jnp.float32(temperature))
+
+    def reset(self, key: Array, params: EnvParams) -> tuple[Any, EnvState]:
+        """Draws a start from the bank: (observation, state)."""
+        start = jax.random.randint(key, (), 0, params.bank.size)
+        state = EnvState(params.bank.latent[start], kinematics.at_rest_of_frame(params.bank.speed_mps[start]),
+                         start, jnp.int32(0), jnp.float32(0), jnp.bool_(False))
+        return self.observe(state, params), state
+
+    def observe(self, state: EnvState, params: EnvParams) -> Any:
+        """The observation of a state."""
+        features = state.latent.features
+        wanted = () if self.observation == "features" else tuple(self.observation)
+        return self._observe(features, self._decode(params.variables, features, wanted)[0])
+
+    def step(self, key: Array, state: EnvState, action: Array, params: EnvParams) -> tuple[EnvState, Transition]:
+        """One imagined step under action [2], clipped to [-1, 1]; see Transition. No auto-reset: `restart` does it."""
+        action = self._checked(action)
+        noise = params.temperature * jax.random.normal(key, state.latent.stochastic.shape)
+        batched = jax.tree.map(lambda leaf: jnp.expand_dims(leaf, 0), (noise, action, state.latent))
+        latent, _ = self.model.imagine_step(params.variables, *batched)
+        latent = latent[0]
+        motion = state.motion
+        if self.contract.kinematics == "bicycle":
+            motion = kinematics.drive(motion, action, self.contract, self.periods)
+        full, for_reward = self._decode(params.variables, latent.features)
+        route_map = None if params.bank.route_map is None else params.bank.route_map[state.start]
+        moment = rewards.Moment(state.motion, motion, action, latent.features, for_reward, route_map)
+        reward, terminated, terms = self._reward(moment)
+        after = EnvState(latent, motion, state.start, state.time + 1, reward, terminated)
+        truncated = after.time >= params.max_steps_in_episode
+        return after, Transition(self._observe(latent.features, full), reward, terminated, truncated, terms)
+
+    def restart(self, key: Array, state: EnvState, observation: Any, final: Array,
+                params: EnvParams) -> tuple[EnvState, Any]:
+        """Where `final`, a fresh start takes the place of state and observation."""
+        fresh_observation, fresh = self.reset(key, params)
+        choose = lambda new, old: jnp.where(final, new, old)
+        return jax.tree.map(choose, fresh, state), jax.tree.map(choose, fresh_observation, observation)
+
+    def _reward(self, moment: rewards.Moment) -> tuple[Array, Array, dict[str, Array]]:
+        if self.reward_function is not None:
+            return self.reward_function(moment)
+        return rewards.driving_reward(moment, grid=self.model.config.voxels, contract=self.contract, step_s=self.step_s,
+                                      config=self.reward_config)
+
+    def _decode(self, variables: Variables, features: Array, heads: tuple[str, ...] | None = None):
+        """(full-size predictions, predictions for the reward) of the heads; unused ones are dropped by the compiler."""
+        names = self.decoded_heads if heads is None else heads
+        if not names:
+            return {}, {}
+        scales = self.model.decode(variables, features, names)
+        full = {name: scales[name][1] for name in names}
+        return full, full if "occupancy" not in names else {
+            **full, "occupancy": scales["occupancy"][self.reward_config.occupancy_scale]}
+
+    def _observe(self, features: Array, decoded: dict[str, Array]) -> Any:
+        if self.observation == "features":
+            return self.model.policy_features(features)
+        return {name: decoded[name] for name in self.observation}
+
+    def _checked(self, action: Array) -> Array:
+        shape = jnp.shape(action)
+        if shape != (ACTION_CHANNELS,):
+            raise ValueError(f"Environment.step: got an action {list(shape)}, expected [2] (acceleration, steering).")
+        checks.action_values(action, "Environment.step")
+        return jnp.clip(jnp.asarray(action, jnp.float32), -1.0, 1.0)
+
+
+def bank_of(observed: Observed, batch: Batch, *, skip: int = 0) -> StartBank:
+    """All frames of observed windows as start states; the first `skip` of each window are left out.
+
+    Args:
+      observed: Observed [B, T, ...] of `batch`.
+      batch: with speed_mps; its route_map comes along where there is one.
+      skip: frames whose latent has seen too little yet.
+
+    Raises:
+      ValueError: if the batch has no speed or no frame is left.
+    """
+    if batch.speed_mps is None:
+        raise ValueError("bank_of: Batch.speed_mps is None; imagined drives need the speed at their start.")
+    if not 0 <= skip < batch.frames:
+        raise ValueError(f"bank_of: skip is {skip}, but windows have {batch.frames} frames.")
+    merge = lambda leaf: jnp.asarray(leaf[:, skip:]).reshape(-1, *leaf.shape[2:])
+    return StartBank(jax.tree.map(merge, observed.states), merge(batch.speed_mps),
+                     None if batch.route_map is None else merge(batch.route_map))
+
+
+@functools.partial(jax.jit, static_argnames=("environment", "horizon"))
+def play(environment: Environment, params: EnvParams, key: Array, state: EnvState, driver: Any,
+         horizon: int) -> tuple[EnvState, Transition]:
+    """Rolls one episode on: driver is actions [H, 2] or a jax.tree_util.Partial policy(key, observation) -> action.
+
+    Returns the states and Transitions [H, ...]; nothing restarts.
+    """
+    def step(state, inputs):
+        key, action = inputs
+        key_policy, key_step = jax.random.split(key)
+        if action is None:
+            action = driver(key_policy, environment.observe(state, params))
+        state, transition = environment.step(key_step, state, action, params)
+        return state, (state, transition)
+
+    actions = None if callable(driver) else driver
+    _, (states, transitions) = jax.lax.scan(step, state, (jax.random.split(key, horizon), actions))
+    return states, transitions
+
+
+def make(model: WorldModel, config: config_lib.Config, **options: Any) -> Environment:
+    """The environment of a run: contract and stride come from its config; options as in Environment."""
+    return Environment(model, contract=config.contract, periods=config.data.stride, **options)
+

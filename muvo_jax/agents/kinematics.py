@@ -1,0 +1,77 @@
+"""Where imagined actions take the car: the kinematic bicycle of the action contract, in JAX.
+
+The same equations as the town's simulator: a period of dt seconds changes the speed to v' = max(0, v + pedal dt),
+drives the distance d = (v + v') dt / 2, turns by -d tan(steering * steer_full) / wheelbase (steering > 0 is right), and
+moves along the mean of old and new heading.
+"""
+
+from __future__ import annotations
+
+import flax.struct
+import jax
+import jax.numpy as jnp
+
+from muvo_jax import config as config_lib
+from muvo_jax.types import Array
+
+
+@flax.struct.dataclass
+class Motion:
+    """The car in the ego frame of the moment where imagination started (x forward, y left).
+
+    Attributes:
+      pose: float32 [..., 3], x (m), y (m), yaw (rad, counter-clockwise).
+      speed_mps: float32 [...].
+    """
+
+    pose: Array
+    speed_mps: Array
+
+
+def at_rest_of_frame(speed_mps: Array) -> Motion:
+    """The start: pose 0, speed as measured."""
+    speed_mps = jnp.asarray(speed_mps, jnp.float32)
+    return Motion(jnp.zeros((*speed_mps.shape, 3), jnp.float32), speed_mps)
+
+
+def acceleration_mps2(action: Array, contract: config_lib.ActionContract) -> Array:
+    """Longitudinal acceleration [...] that an action [..., 2] asks for."""
+    pedal = jnp.clip(action[..., 0], -1.0, 1.0)
+    return jnp.where(pedal > 0, pedal * contract.accel_full_mps2, pedal * contract.brake_full_mps2)
+
+
+def curvature_per_m(action: Array, contract: config_lib.ActionContract) -> Array:
+    """Turn to the left per metre driven [...], 1/m: -tan(steering * steer_full) / wheelbase."""
+    return -jnp.tan(jnp.clip(action[..., 1], -1.0, 1.0) * contract.steer_full_rad) / contract.wheelbase_m
+
+
+def drive(motion: Motion, action: Array, contract: config_lib.ActionContract, periods: int = 1) -> Motion:
+    """Applies an action [..., 2] for `periods` periods of 1 / contract.rate_hz; a model step is data.stride of them.
+
+    Raises:
+      ValueError: if the contract's kinematics are not the bicycle's.
+    """
+    if contract.kinematics != "bicycle":
+        raise ValueError(f"contract.kinematics is {contract.kinematics!r}: the ego path follows from actions only with "
+                         f"'bicycle'; use the path of an ego-motion head or give the reward no path.")
+    seconds = 1.0 / contract.rate_hz
+    pedal_mps2, curvature = acceleration_mps2(action, contract), curvature_per_m(action, contract)
+    pose, speed = motion.pose, motion.speed_mps
+    for _ in range(periods):
+        new_speed = jnp.maximum(speed + pedal_mps2 * seconds, 0.0)
+        distance = 0.5 * (speed + new_speed) * seconds
+        turn = distance * curvature
+        heading = pose[..., 2] + 0.5 * turn
+        pose = pose + jnp.stack([distance * jnp.cos(heading), distance * jnp.sin(heading), turn], axis=-1)
+        speed = new_speed
+    return Motion(pose, speed)
+
+
+def path(start: Motion, actions: Array, contract: config_lib.ActionContract, periods: int = 1) -> Motion:
+    """The motion after each action: start [...], actions [..., H, 2] -> Motion [..., H, ...]."""
+    def step(motion, action):
+        motion = drive(motion, action, contract, periods)
+        return motion, motion
+
+    _, motions = jax.lax.scan(step, start, jnp.moveaxis(actions, -2, 0))
+    return Motion(jnp.moveaxis(motions.pose, 0, -2), jnp.moveaxis(motions.speed_mps, 0, -1))

@@ -1,0 +1,167 @@
+"""Planning over action sequences in imagination: CEM and iCEM, MPPI, and gradient ascent. All of them jit end to end.
+
+A planner maximises `objective(key, plans [P, H, 2]) -> returns [P]`, for example `imagined_returns` of an environment,
+and starts from a plan [H, 2], zeros or the last plan shifted by one step (`shift`).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+
+import flax.struct
+import jax
+import jax.numpy as jnp
+import optax
+
+from muvo_jax.agents import environment as environment_lib
+from muvo_jax.types import Array
+
+Objective = Callable[[Array, Array], Array]
+
+
+@dataclasses.dataclass(frozen=True)
+class PlannerConfig:
+    """Settings of all planners; each reads what it needs.
+
+    Attributes:
+      plans: P, candidates per iteration.
+      iterations: refinements.
+      elites: the best ones, to which CEM fits its Gaussian.
+      kept: elites that iCEM carries on to the next iteration (0: plain CEM).
+      noise_exponent: iCEM draws noise with power 1 / f**exponent over time; 0 is white (plain CEM).
+      std: first standard deviation of both action channels.
+      smoothing: share of the old mean and deviation that stays.
+      temperature: of MPPI's weights exp(return / temperature), in units of return.
+      learning_rate: of gradient planning (Adam).
+    """
+
+    plans: int = 64
+    iterations: int = 4
+    elites: int = 8
+    kept: int = 3
+    noise_exponent: float = 2.0
+    std: float = 0.5
+    smoothing: float = 0.1
+    temperature: float = 0.5
+    learning_rate: float = 0.1
+
+    def __post_init__(self):
+        if not 0 <= self.kept <= self.elites <= self.plans or self.elites < 1 or self.iterations < 1:
+            raise ValueError(f"PlannerConfig: expected 0 <= kept <= elites <= plans, at least one elite and one "
+                             f"iteration; got kept={self.kept}, elites={self.elites}, plans={self.plans}, "
+                             f"iterations={self.iterations}.")
+
+
+@flax.struct.dataclass
+class Plan:
+    """The result: actions [H, 2] in [-1, 1] and the return expected of them."""
+
+    actions: Array
+    value: Array
+
+
+def cem(objective: Objective, key: Array, start: Array, config: PlannerConfig = PlannerConfig()) -> Plan:
+    """The cross-entropy method; with `kept` and `noise_exponent` its improved form (Pinneri et al. 2020).
+
+    Returns the best plan seen.
+    """
+    horizon, channels = start.shape
+
+    def iterate(carry, key):
+        mean, std, elites, elite_values = carry
+        key_noise, key_value = jax.random.split(key)
+        noise = coloured_noise(key_noise, (config.plans, horizon, channels), config.noise_exponent)
+        plans = jnp.clip(mean[None] + std[None] * noise, -1.0, 1.0).at[0].set(mean)
+        values = jnp.concatenate([_finite(objective(key_value, plans)), elite_values[:config.kept]])
+        plans = jnp.concatenate([plans, elites[:config.kept]])
+        elite_values, index = jax.lax.top_k(values, config.elites)
+        elites = plans[index]
+        blend = lambda old, new: config.smoothing * old + (1.0 - config.smoothing) * new
+        return (blend(mean, elites.mean(axis=0)), blend(std, elites.std(axis=0)), elites, elite_values), None
+
+    first = (jnp.clip(start, -1.0, 1.0), jnp.full_like(start, config.std),
+             jnp.zeros((config.elites, horizon, channels)), jnp.full((config.elites,), -jnp.inf))
+    (_, _, elites, values), _ = jax.lax.scan(iterate, first, jax.random.split(key, config.iterations))
+    return Plan(elites[0], values[0])
+
+
+def mppi(objective: Objective, key: Array, start: Array, config: PlannerConfig = PlannerConfig()) -> Plan:
+    """Model-predictive path integral control: the mean of all plans, weighted by exp(return / temperature)."""
+    def iterate(mean, key):
+        key_noise, key_value = jax.random.split(key)
+        noise = config.std * jax.random.normal(key_noise, (config.plans, *start.shape))
+        plans = jnp.clip(mean[None] + noise, -1.0, 1.0).at[0].set(mean)
+        values = _finite(objective(key_value, plans))
+        weights = jax.nn.softmax(values / config.temperature)
+        return jnp.einsum("p,pha->ha", weights, plans), None
+
+    mean, _ = jax.lax.scan(iterate, jnp.clip(start, -1.0, 1.0), jax.random.split(key, config.iterations))
+    return Plan(mean, objective(jax.random.fold_in(key, config.iterations), mean[None])[0])
+
+
+def gradient(objective: Objective, key: Array, start: Array, config: PlannerConfig = PlannerConfig()) -> Plan:
+    """Gradient ascent on the return through the world model, projected to [-1, 1]; returns the best plan seen."""
+    optimizer = optax.adam(config.learning_rate)
+    value_and_gradient = jax.value_and_grad(lambda plan, key: objective(key, plan[None])[0])
+
+    def iterate(carry, key):
+        plan, state, best = carry
+        value, slope = value_and_gradient(plan, key)
+        better = value > best.value
+        best = Plan(jnp.where(better, plan, best.actions), jnp.where(better, value, best.value))
+        updates, state = optimizer.update(-jnp.nan_to_num(slope), state)
+        return (jnp.clip(optax.apply_updates(plan, updates), -1.0, 1.0), state, best), None
+
+    start = jnp.clip(start, -1.0, 1.0)
+    first = (start, optimizer.init(start), Plan(start, jnp.float32(-jnp.inf)))
+    (plan, _, best), _ = jax.lax.scan(iterate, first, jax.random.split(key, config.iterations))
+    value = objective(key, plan[None])[0]
+    better = value > best.value
+    return Plan(jnp.where(better, plan, best.actions), jnp.where(better, value, best.value))
+
+
+PLANNERS = {"cem": cem, "mppi": mppi, "gradient": gradient}
+
+
+def imagined_returns(environment: environment_lib.Environment, params: environment_lib.EnvParams,
+                     state: environment_lib.EnvState, *, discount: float = 0.98, noises: int = 1) -> Objective:
+    """The discounted return of plans from one EnvState, averaged over `noises` imagined futures.
+
+    All plans see the same noise, so that they differ by their actions alone. After a predicted collision nothing more
+    is earned.
+    """
+    def returns(key, plans):
+        horizon = plans.shape[1]
+
+        def one(key, plan):
+            _, transitions = environment_lib.play(environment, params, key, state, plan, horizon)
+            alive = 1.0 - transitions.terminated.astype(jnp.float32)
+            before = jnp.concatenate([jnp.ones(1), jnp.cumprod(alive)[:-1]])
+            return (discount ** jnp.arange(horizon) * before * transitions.reward).sum()
+
+        keys = jax.random.split(key, noises)
+        return jax.vmap(lambda plan: jax.vmap(one, (0, None))(keys, plan).mean())(plans)
+
+    return returns
+
+
+def shift(plan: Array) -> Array:
+    """The plan [H, 2] one step later; its last action is repeated."""
+    return jnp.concatenate([plan[1:], plan[-1:]])
+
+
+def coloured_noise(key: Array, shape: tuple[int, int, int], exponent: float) -> Array:
+    """Unit-variance noise [P, H, A] whose power falls with frequency over H as 1 / f**exponent; 0 gives white noise."""
+    white = jax.random.normal(key, shape)
+    if not exponent or shape[1] < 2:
+        return white
+    frequencies = jnp.fft.rfftfreq(shape[1])
+    scale = jnp.maximum(frequencies, frequencies[1]) ** (-exponent / 2)
+    coloured = jnp.fft.irfft(jnp.fft.rfft(white, axis=1) * scale[None, :, None], n=shape[1], axis=1)
+    weights = jnp.where((jnp.arange(scale.shape[0]) == 0) | (2 * jnp.arange(scale.shape[0]) == shape[1]), 1.0, 2.0)
+    return coloured / jnp.sqrt((weights * scale**2).sum() / shape[1])
+
+
+def _finite(values: Array) -> Array:
+    return jnp.where(jnp.isfinite(values), values, -jnp.inf)

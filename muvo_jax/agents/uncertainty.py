@@ -1,0 +1,137 @@
+"""How far imagined futures can be trusted: scores of N branches against what happened, and a discount for agents.
+
+All are pure functions of arrays; N is the axis of branches.
+"""
+
+from __future__ import annotations
+
+import flax.struct
+import jax
+import jax.numpy as jnp
+
+from muvo_jax.types import OCCUPANCY_OCCUPIED, OCCUPANCY_UNKNOWN, Array
+
+_TINY = 1e-12
+
+
+@flax.struct.dataclass
+class Reliability:
+    """A reliability curve over K bins of equal width.
+
+    Attributes:
+      confidence: float32 [K], mean predicted probability in a bin; NaN where it is empty.
+      frequency: float32 [K], share of its voxels that were occupied; NaN where it is empty.
+      count: float32 [K], voxels.
+    """
+
+    confidence: Array
+    frequency: Array
+    count: Array
+
+    @property
+    def calibration_error(self) -> Array:
+        """Expected calibration error: the mean of |confidence - frequency|, weighted by count."""
+        gap = jnp.where(self.count > 0, jnp.abs(self.confidence - self.frequency), 0.0)
+        return (gap * self.count).sum() / jnp.maximum(self.count.sum(), 1.0)
+
+
+def branch_probability(logits: Array, axis: int = 1) -> Array:
+    """Probability of being occupied from logits [B, N, ..., 2]: the mean over branches of each one's softmax."""
+    return jax.nn.sigmoid(logits[..., 1] - logits[..., 0]).mean(axis=axis)
+
+
+def brier_score(probability: Array, occupancy: Array) -> Array:
+    """Mean of (p - occupied)^2 over the voxels that are known; NaN where none is. Shapes agree."""
+    known = occupancy != OCCUPANCY_UNKNOWN
+    square = (probability - (occupancy == OCCUPANCY_OCCUPIED)) ** 2
+    return jnp.where(known, square, 0.0).sum() / known.sum()
+
+
+def reliability(probability: Array, occupancy: Array, bins: int = 10) -> Reliability:
+    """How often voxels were occupied that were said to be so with a probability; unknown voxels are left out."""
+    known = (occupancy != OCCUPANCY_UNKNOWN).ravel().astype(jnp.float32)
+    occupied = (occupancy == OCCUPANCY_OCCUPIED).ravel().astype(jnp.float32)
+    index = jnp.clip((probability.ravel() * bins).astype(jnp.int32), 0, bins - 1)
+    add = lambda values: jnp.zeros(bins, jnp.float32).at[index].add(values * known)
+    count = add(jnp.ones_like(occupied))
+    return Reliability(add(probability.ravel()) / count, add(occupied) / count, count)
+
+
+def crps(samples: Array, truth: Array, axis: int = 0) -> Array:
+    """Continuous ranked probability score, in the unit of the values: E|X - y| - E|X - X'| / 2, the fair estimate.
+
+    Args:
+      samples: [N, ...] with at least two branches on `axis`.
+      truth: [...].
+
+    Returns:
+      [...]; 0 is perfect. Of pairs, X and X' are different branches (Ferro 2014), so that N does not matter.
+
+    Raises:
+      ValueError: for fewer than two branches.
+    """
+    samples = jnp.moveaxis(samples, axis, 0)
+    branches = samples.shape[0]
+    if branches < 2:
+        raise ValueError(f"crps: got {branches} branch, expected at least 2.")
+    ordered = jnp.sort(samples, axis=0)
+    # The sum over pairs of |x_i - x_j| is 2 sum_i (2 i - N + 1) x_(i), i counted from 0.
+    rank = (2.0 * jnp.arange(branches) - branches + 1.0).reshape(-1, *(1,) * truth.ndim)
+    spread = (rank * ordered).sum(axis=0) / (branches * (branches - 1))
+    return jnp.abs(samples - truth[None]).mean(axis=0) - spread
+
+
+def best_of(errors: Array, axis: int = 1) -> tuple[Array, Array]:
+    """(error of the best branch, mean error of all): their gap says what the choice among N futures is worth."""
+    return errors.min(axis=axis), errors.mean(axis=axis)
+
+
+def trust(features: Array) -> Array:
+    """How much of what is imagined still follows from the start: 1 - variance among branches / variance of everything.
+
+    By the law of total variance 1 where all branches of a start agree, 0 where they differ as much as the futures of
+    different starts do. Summed over channels, never rising along the horizon.
+
+    Args:
+      features: [B, N, H, F] of B > 1 starts and N > 1 branches.
+
+    Returns:
+      float32 [B, H] in [0, 1].
+
+    Raises:
+      ValueError: for one start or one branch.
+    """
+    if features.shape[0] < 2 or features.shape[1] < 2:
+        raise ValueError(f"trust: got features {list(features.shape)}, expected at least 2 starts and 2 branches.")
+    among = features.var(axis=1, ddof=1).sum(axis=-1)
+    total = features.var(axis=(0, 1)).sum(axis=-1)
+    share = jnp.clip(1.0 - among / jnp.maximum(total, _TINY)[None], 0.0, 1.0)
+    return jax.lax.cummin(share, axis=1)
+
+
+def trust_discount(trusted: Array) -> Array:
+    """The discount of each step [..., H] whose running product is `trusted`: multiply an agent's discount by it."""
+    before = jnp.concatenate([jnp.ones_like(trusted[..., :1]), trusted[..., :-1]], axis=-1)
+    return jnp.where(before > 0, trusted / jnp.maximum(before, _TINY), 0.0)
+
+
+def trust_horizon(trusted: Array, threshold: float = 0.5) -> Array:
+    """Steps [...] that stay at or above `threshold`."""
+    return (trusted >= threshold).sum(axis=-1)
+
+
+def action_sensitivity(predicted: tuple[Array, Array], true: tuple[Array, Array]) -> dict[str, Array]:
+    """Whether other actions change the prediction as they change the world.
+
+    Args:
+      predicted: what the model imagined under two plans, with the same noise (`imagine(..., same_noise=True)`).
+      true: what the simulator showed under the same two plans.
+
+    Returns:
+      "gain": regression of the predicted on the true response, 1 is right, 0 means that actions are ignored;
+      "correlation" of the two responses (NaN where one of them is 0).
+    """
+    response, truth = predicted[1] - predicted[0], true[1] - true[0]
+    product = (response * truth).sum()
+    energy, true_energy = (response**2).sum(), (truth**2).sum()
+    return {"gain": product / true_energy, "correlation": product / jnp.sqrt(energy * true_energy)}

@@ -1,0 +1,43 @@
+"""The actor-critic: lambda returns by hand, and learning what is easy to learn."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from worlds import make
+
+from muvo_jax.agents import actor_critic
+
+
+def test_lambda_returns_by_hand():
+    reward, discount, value = jnp.array([1.0, 2.0, 3.0]), jnp.array([0.5, 0.5, 0.5]), jnp.array([10.0, 20.0, 30.0])
+    last = 3 + 0.5 * 30
+    middle = 2 + 0.5 * (0.2 * 20 + 0.8 * last)
+    first = 1 + 0.5 * (0.2 * 10 + 0.8 * middle)
+    np.testing.assert_allclose(actor_critic.lambda_returns(reward, discount, value, 0.8), [first, middle, last])
+    ended = actor_critic.lambda_returns(reward, discount.at[1].set(0.0), value, 0.8)
+    np.testing.assert_allclose(ended[1], 2.0)  # nothing counts after the end
+
+
+def test_log_probability_is_that_of_the_squashed_gaussian():
+    mean, std = jnp.array([0.3, -0.2]), jnp.array([0.5, 0.8])
+    drawn = jnp.array([0.7, 0.1])
+    normal = jnp.exp(-0.5 * ((drawn - mean) / std) ** 2) / std
+    want = jnp.log(normal / (1 - jnp.tanh(drawn) ** 2)).sum()
+    np.testing.assert_allclose(actor_critic._log_probability(mean, std, drawn), want, rtol=1e-5)
+
+
+def test_it_learns_to_brake_where_braking_pays():
+    def braking(moment):
+        reward = -moment.action[..., 0]
+        return reward, jnp.zeros(reward.shape, bool), {}
+
+    environment, params = make(reward_function=braking)
+    config = actor_critic.ActorCriticConfig(starts=16, horizon=4, width=16, layers=1, learning_rate=1e-2)
+    learner = actor_critic.init(jax.random.key(0), environment, config)
+    rewards = []
+    for key in jax.random.split(jax.random.key(1), 80):
+        learner, metrics = actor_critic.update(environment, config, params, key, learner)
+        rewards.append(metrics["reward"])
+    assert abs(np.mean(rewards[:3])) < 0.3 and np.mean(rewards[-5:]) > 0.5
+    action = actor_critic.policy(config, learner.actor, sampled=False)(None, params.bank.latent.features[0])
+    assert action[0] < -0.4

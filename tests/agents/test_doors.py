@@ -1,0 +1,218 @@
+"""One conformance suite for all doors; where a library is not installed its door is skipped (see .ci/run-agents)."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from worlds import HORIZON, MODEL, make, variables
+
+from muvo_jax.agents.doors import dreamer, optional
+
+ACTION = jnp.array([0.5, -0.2])
+
+
+class GymnaxDoor:
+    def __init__(self):
+        pytest.importorskip("gymnax", reason="gymnax is not installed")
+        from muvo_jax.agents.doors import gymnax_env
+        core, self.params = make()
+        self.env = gymnax_env.GymnaxImagination(core, self.params)
+
+    def start(self, key):
+        observation, state = self.env.reset(key, self.params)
+        return observation, (key, state)
+
+    def step(self, carry, action):
+        """(observation that follows, final observation, reward, terminated, truncated), carry."""
+        key, state = carry
+        key, key_step = jax.random.split(key)
+        observation, state, reward, terminated, truncated, info = self.env.step(key_step, state, action, self.params)
+        return (observation, info["final_observation"], reward, terminated, truncated), (key, state)
+
+
+class BraxDoor:
+    def __init__(self):
+        pytest.importorskip("brax", reason="brax is not installed")
+        from muvo_jax.agents.doors import brax_env
+        core, params = make()
+        self.env = brax_env.BraxImagination(core, params)
+
+    def start(self, key):
+        state = self.env.reset(key)
+        return state.obs, state
+
+    def step(self, carry, action):
+        state = self.env.step(carry, action)
+        return (state.obs, state.obs, state.reward, state.done > 0, state.info["truncation"] > 0), state
+
+
+class StoaDoor:
+    def __init__(self):
+        pytest.importorskip("stoa", reason="stoa-env is not installed")
+        from muvo_jax.agents.doors import stoa_env
+        core, params = make()
+        self.env = stoa_env.StoaImagination(core, params)
+
+    def start(self, key):
+        state, timestep = self.env.reset(key)
+        assert timestep.first()
+        return timestep.observation, state
+
+    def step(self, carry, action):
+        state, timestep = self.env.step(carry, action)
+        return (timestep.observation, timestep.observation, timestep.reward, timestep.terminated(),
+                timestep.truncated()), state
+
+
+DOORS = {"gymnax": GymnaxDoor, "brax": BraxDoor, "stoa": StoaDoor}
+
+
+@pytest.fixture(scope="module", params=DOORS)
+def door(request):
+    return DOORS[request.param]()
+
+
+def raw_or_typed(door, seed):
+    return jax.random.PRNGKey(seed) if isinstance(door, BraxDoor) else jax.random.key(seed)
+
+
+def rollout(door, key):
+    observation, carry = door.start(key)
+    step = jax.jit(door.step)
+    results = []
+    for _ in range(HORIZON):
+        result, carry = step(carry, ACTION)
+        results.append(result)
+    return observation, results, carry
+
+
+def test_an_episode_is_deterministic_and_truncated_at_the_horizon(door):
+    observation, results, _ = rollout(door, raw_or_typed(door, 0))
+    assert observation.shape == (MODEL.policy_feature_channels,) and observation.dtype == jnp.float32
+    assert [bool(result[4]) for result in results] == [False, False, True]
+    assert not any(bool(result[3]) for result in results)
+    assert all(np.isfinite(result[2]) for result in results)
+    again = rollout(door, raw_or_typed(door, 0))[1]
+    np.testing.assert_array_equal(results[-1][1], again[-1][1])
+    other = rollout(door, raw_or_typed(door, 1))[1]
+    assert not np.allclose(results[-1][1], other[-1][1])
+
+
+def test_a_door_vmaps(door):
+    keys = jax.vmap(jax.random.key)(jnp.arange(4))
+    if isinstance(door, BraxDoor):
+        keys = jax.random.key_data(keys)
+    observation, carry = jax.vmap(door.start)(keys)
+    (following, _, reward, _, _), _ = jax.jit(jax.vmap(door.step, (0, None)))(carry, ACTION)
+    assert observation.shape == following.shape == (4, MODEL.policy_feature_channels)
+    assert reward.shape == (4,)
+    _, carry_one = door.start(keys[2])
+    np.testing.assert_allclose(door.step(carry_one, ACTION)[0][0], following[2], atol=1e-5)
+
+
+def test_gymnax_restarts_by_itself_and_lets_gradients_through_on_demand():
+    door = GymnaxDoor()
+    _, results, (_, state) = rollout(door, jax.random.key(0))
+    assert state.time == 0 and not np.allclose(results[-1][0], results[-1][1])
+    env = door.env.with_transition_gradients()
+    _, state = env.reset(jax.random.key(0), door.params)
+    following = lambda env, action: env.step(jax.random.key(1), state, action, door.params)[0].sum()
+    assert np.abs(jax.grad(lambda action: following(env, action))(ACTION)).max() > 0
+    assert np.abs(jax.grad(lambda action: following(door.env, action))(ACTION)).max() == 0
+    assert env.action_space().contains(ACTION) and env.observation_space().shape == (MODEL.policy_feature_channels,)
+
+
+def test_brax_wrappers_truncate_and_reset():
+    door = BraxDoor()
+    training = pytest.importorskip("brax.envs.wrappers.training")
+    env = training.wrap(door.env, episode_length=door.env.episode_length)
+    state = env.reset(jax.random.split(jax.random.PRNGKey(0), 2))
+    step = jax.jit(env.step)
+    for _ in range(HORIZON):
+        state = step(state, jnp.stack([ACTION] * 2))
+    assert state.done.tolist() == [1, 1] and state.info["truncation"].tolist() == [1, 1]
+    np.testing.assert_allclose(state.obs, state.info["first_obs"])
+
+
+def test_stoa_wrappers_reset_and_keep_the_final_observation():
+    door = StoaDoor()
+    from stoa.core_wrappers import auto_reset
+    env = auto_reset.AutoResetWrapper(door.env, next_obs_in_extras=True)
+    state, timestep = env.reset(jax.random.key(0))
+    step = jax.jit(env.step)
+    for _ in range(HORIZON):
+        state, timestep = step(state, ACTION)
+    assert timestep.truncated() and timestep.discount == 1 and state.core.time == 0
+    assert not np.allclose(timestep.observation, timestep.extras["next_obs"])
+    env.environment_space()
+
+
+def test_gymnasium_agrees_with_its_own_checker():
+    pytest.importorskip("gymnasium", reason="gymnasium is not installed")
+    from gymnasium.utils import env_checker
+
+    from muvo_jax.agents.doors import gymnasium_env
+    env = gymnasium_env.GymnasiumImagination(*make())
+    env_checker.check_env(env, skip_render_check=True)
+    first, _ = env.reset(seed=3)
+    ends = [env.step(np.array(ACTION))[2:4] for _ in range(HORIZON)]
+    assert ends == [(False, False), (False, False), (False, True)]
+    np.testing.assert_array_equal(env.reset(seed=3)[0], first)
+
+
+def test_the_functional_environment_runs_in_gymnasiums_wrapper():
+    pytest.importorskip("gymnasium", reason="gymnasium is not installed")
+    from gymnasium.envs.functional_jax_env import FunctionalJaxEnv
+
+    from muvo_jax.agents.doors import gymnasium_env
+    env = FunctionalJaxEnv(gymnasium_env.FunctionalImagination(*make()), metadata={"render_modes": []})
+    observation, _ = env.reset(seed=0)
+    following, reward, terminated, truncated, _ = env.step(ACTION)
+    assert observation.shape == following.shape == (MODEL.policy_feature_channels,)
+    assert np.isfinite(reward) and not terminated and not truncated
+
+
+@pytest.mark.parametrize("sampled", [False, True])
+def test_mctx_searches_in_imagination(sampled):
+    mctx = pytest.importorskip("mctx", reason="mctx is not installed")
+    from muvo_jax.agents.doors import mctx_model
+    core, params = make()
+    params = dataclasses.replace(params, temperature=jnp.float32(0))
+    grid = mctx_model.action_grid(3, 3)
+    assert grid.shape == (9, 2)
+
+    def candidates(agent, key, observation):
+        return jax.random.uniform(key, (6, 2), minval=-1), jnp.zeros(6), agent * observation.sum()
+
+    prior = candidates if sampled else mctx_model.on_grid(grid, lambda agent, observation: (jnp.zeros(9), agent))
+    model = mctx_model.MctxModel(core, prior)
+    search_params = mctx_model.SearchParams(params, jnp.float32(0))
+
+    @jax.jit
+    def search(key):
+        _, state = jax.vmap(core.reset, (0, None))(jax.random.split(key, 2), params)
+        root = model.root(search_params, key, state)
+        output = mctx.gumbel_muzero_policy(search_params, key, root, model.recurrent_fn, num_simulations=8)
+        return model.action(root, output.action), output.action_weights
+
+    action, weights = search(jax.random.key(0))
+    assert action.shape == (2, 2) and np.abs(action).max() <= 1
+    np.testing.assert_allclose(weights.sum(-1), 1, rtol=1e-5)
+
+
+def test_dreamers_features_are_what_the_actions_were_chosen_on():
+    _, params = make()
+    policy = lambda key, features: jnp.tanh(features[:2])
+    last, features, actions = dreamer.Dreamer(MODEL, variables(), sampled=False).imagine(
+        jax.random.key(0), params.bank.latent, policy, 3)
+    assert features.shape[:2] == actions.shape[:2] == (params.bank.size, 3)
+    np.testing.assert_allclose(features[:, 0], params.bank.latent.features)
+    np.testing.assert_allclose(actions, jnp.tanh(features[..., :2]), atol=1e-6)
+    assert last.stochastic.shape == params.bank.latent.stochastic.shape
+
+
+def test_a_missing_library_names_its_extra():
+    with pytest.raises(ImportError, match=r"pip install 'muvo_jax\[gymnax\]'"):
+        optional.need("a_library_that_does_not_exist", "gymnax")

@@ -1,0 +1,104 @@
+"""The core environment: starts, steps, ends, observations."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from worlds import CONFIG, HORIZON, MODEL, STARTS, bank, make, variables
+
+from muvo_jax.agents import environment as environment_lib
+from muvo_jax.agents import rewards
+from muvo_jax.model import rollout, world_model
+from muvo_jax.types import Batch, Observed
+
+ACTION = jnp.array([0.5, -0.2])
+
+
+def test_an_episode_is_truncated_at_its_horizon_and_not_terminated():
+    environment, params = make()
+    observation, state = jax.jit(environment.reset)(jax.random.key(0), params)
+    assert observation.shape == environment.observation_shapes.shape == (MODEL.policy_feature_channels,)
+    plan = jnp.stack([ACTION] * HORIZON)
+    _, transitions = environment_lib.play(environment, params, jax.random.key(1), state, plan, HORIZON)
+    assert transitions.truncated.tolist() == [False, False, True]
+    assert not transitions.terminated.any()
+    again = environment_lib.play(environment, params, jax.random.key(1), state, plan, HORIZON)
+    np.testing.assert_array_equal(again[1].reward, transitions.reward)
+
+
+def test_without_noise_a_step_is_the_models_and_the_car_moves_by_its_kinematics():
+    environment, params = make()
+    params = dataclasses.replace(params, temperature=jnp.float32(0.0))
+    _, state = environment.reset(jax.random.key(3), params)
+    after, transition = jax.jit(environment.step)(jax.random.key(0), state, ACTION, params)
+    dream = rollout.imagine(MODEL, variables(), jax.random.key(0), state.latent, ACTION[None], sampled=False)
+    np.testing.assert_allclose(transition.observation, dream.features[0], atol=1e-5)
+    start_mps = bank().speed_mps[state.start]
+    np.testing.assert_allclose(after.motion.speed_mps, start_mps + 0.2 * 1.5, rtol=1e-5)
+    np.testing.assert_allclose(transition.terms["progress_m"], 0.2 * (start_mps + 0.15), rtol=0.1)
+
+
+def test_many_cars_restart_one_by_one():
+    environment, params = make()
+    keys = jax.random.split(jax.random.key(0), 6)
+    _, states = jax.vmap(environment.reset, (0, None))(keys, params)
+    assert len(np.unique(states.start)) > 1 and states.start.max() < STARTS
+    states = dataclasses.replace(states, time=jnp.array([0, 1, 2, 2, 1, 0]))
+
+    @jax.jit
+    def advance(keys, states):
+        after, transition = jax.vmap(environment.step, (0, 0, None, None))(keys, states, ACTION, params)
+        return transition, jax.vmap(environment.restart, (0, 0, 0, 0, None))(
+            keys, after, transition.observation, transition.final, params)
+
+    transition, (after, seen) = advance(keys, states)
+    assert transition.truncated.tolist() == [False, False, True, True, False, False]
+    assert after.time.tolist() == [1, 2, 0, 0, 2, 1]
+    assert not np.allclose(seen[2], transition.observation[2])
+    np.testing.assert_array_equal(seen[0], transition.observation[0])
+
+
+def test_gradients_reach_actions_and_a_predicted_collision_ends_the_drive():
+    config = rewards.RewardConfig(terminal_collision=0.0, occupancy_scale=4)
+    environment, params = make(reward_config=config)
+    assert environment.decoded_heads == ("occupancy",)
+    _, state = environment.reset(jax.random.key(0), params)
+
+    def total(actions):
+        _, transitions = environment_lib.play(environment, params, jax.random.key(1), state, actions, 2)
+        return transitions.reward.sum(), transitions
+
+    (_, transitions), gradient = jax.value_and_grad(total, has_aux=True)(jnp.zeros((2, 2)))
+    assert transitions.terminated.all() and not transitions.truncated.any()
+    assert np.isfinite(gradient).all() and np.abs(gradient).max() > 0
+
+
+def test_the_bank_holds_every_frame_after_the_first_ones():
+    states = jax.tree.map(lambda leaf: jnp.stack([leaf[:3], leaf[2:]]), bank().latent)
+    batch = Batch(np.zeros((2, 3, 2), np.float32), np.zeros((2, 3), bool), speed_mps=np.arange(6.0).reshape(2, 3))
+    made = environment_lib.bank_of(Observed(states, None, None), batch, skip=1)
+    assert made.size == 4 and made.speed_mps.tolist() == [1, 2, 4, 5] and made.route_map is None
+    with pytest.raises(ValueError, match="skip is 3"):
+        environment_lib.bank_of(Observed(states, None, None), batch, skip=3)
+
+
+def test_what_does_not_fit_is_refused():
+    blind = world_model.WorldModel(dataclasses.replace(CONFIG, heads=("image", "action")))
+    with pytest.raises(ValueError, match="read the head occupancy, but this run trained image, action"):
+        environment_lib.Environment(blind)
+    environment, params = make()
+    with pytest.raises(ValueError, match="horizon is 0"):
+        make(horizon=0)
+    wrong = dataclasses.replace(bank(), speed_mps=jnp.zeros((2,)))
+    with pytest.raises(ValueError, match=r"states \[5\] and speeds \[2\]"):
+        environment.params({}, wrong, 3)
+    _, state = environment.reset(jax.random.key(0), params)
+    with pytest.raises(ValueError, match=r"action \[3\], expected \[2\]"):
+        environment.step(jax.random.key(0), state, jnp.zeros(3), params)
+    with pytest.raises(ValueError, match="reach from 2 to 2"):
+        environment.step(jax.random.key(0), state, jnp.full((2,), 2.0), params)
+    none = dataclasses.replace(environment.contract, kinematics="none")
+    with pytest.raises(ValueError, match="pass a reward_function"):
+        dataclasses.replace(environment, contract=none)

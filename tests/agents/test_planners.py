@@ -1,0 +1,56 @@
+"""Planners find a known optimum, and plan in imagination under jit."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from worlds import make
+
+from muvo_jax.agents import planners
+
+GOAL = jnp.stack([jnp.linspace(-0.6, 0.6, 6), jnp.full((6,), 0.3)], axis=-1)
+SETTINGS = {"cem": {"iterations": 12}, "mppi": {"iterations": 20, "std": 0.2, "temperature": 0.02, "plans": 256},
+            "gradient": {"iterations": 60}}
+
+
+@pytest.mark.parametrize("name", planners.PLANNERS)
+def test_a_planner_comes_near_the_best_plan(name):
+    objective = lambda key, plans: -((plans - GOAL[None]) ** 2).mean(axis=(1, 2))
+    config = planners.PlannerConfig(**SETTINGS[name])
+    plan = jax.jit(lambda key: planners.PLANNERS[name](objective, key, jnp.zeros((6, 2)), config))(jax.random.key(0))
+    np.testing.assert_allclose(plan.actions, GOAL, atol=0.25)
+    np.testing.assert_allclose(plan.value, objective(None, plan.actions[None])[0], atol=1e-6)
+    assert plan.value > -0.01 > objective(None, jnp.zeros((1, 6, 2)))[0]
+
+
+def test_a_plan_that_gives_nan_is_never_chosen():
+    objective = lambda key, plans: jnp.where(plans[:, 0, 0] > 0, jnp.nan, plans[:, 0, 0])
+    plan = planners.cem(objective, jax.random.key(0), jnp.zeros((3, 2)))
+    assert -0.2 < plan.value <= 0
+
+
+def test_in_imagination_the_fast_plan_is_found():
+    environment, params = make()
+    _, state = environment.reset(jax.random.key(0), params)
+    config = planners.PlannerConfig(plans=16, iterations=2, elites=4, kept=1)
+
+    @jax.jit
+    def best(key):
+        objective = planners.imagined_returns(environment, params, state, noises=2)
+        return planners.cem(objective, key, jnp.zeros((4, 2)), config), objective(key, jnp.zeros((1, 4, 2)))[0]
+
+    plan, idle = best(jax.random.key(1))
+    assert plan.value > idle and plan.actions[0, 0] > 0  # accelerating brings the car farther
+
+
+def test_coloured_noise_has_unit_variance_and_is_smooth():
+    noise = planners.coloured_noise(jax.random.key(0), (4000, 9, 2), 2.0)
+    np.testing.assert_allclose(noise.std(), 1.0, atol=0.03)
+    step = np.corrcoef(noise[:, :-1].ravel(), noise[:, 1:].ravel())[0, 1]
+    white = planners.coloured_noise(jax.random.key(0), (4000, 9, 2), 0.0)
+    assert step > 0.5 > abs(np.corrcoef(white[:, :-1].ravel(), white[:, 1:].ravel())[0, 1]) * 10
+
+
+def test_settings_that_make_no_sense_are_refused():
+    with pytest.raises(ValueError, match="kept=9, elites=8"):
+        planners.PlannerConfig(kept=9)

@@ -1,0 +1,51 @@
+"""Every parameter of every variant of the reference has exactly one counterpart of the same shape here."""
+
+import math
+import re
+
+import jax
+import pytest
+
+from muvo_jax import config as config_lib
+from muvo_jax.interop import names, packs
+from muvo_jax.model import world_model
+
+LIDAR_ONLY = ("range_view", "action")
+VARIANTS = {
+    "1d_RV_WOB_TR_voxel": {"heads": config_lib.HEADS},
+    "1d_RV_WOB_TR_novoxel": {"heads": ("image", "range_view", "action")},
+    "RV_BEV_TR": {"camera": "bev"},
+    "PP_WOB_TR": {"lidar": "pp"},
+    "PP_BEV_TR": {"lidar": "pp", "camera": "bev"},
+    "RV_WOB_FC": {"fusion": "fc"},
+    "PP_WOB_FC": {"fusion": "fc", "lidar": "pp"},
+    "RV_BEV_FC": {"fusion": "fc", "camera": "bev"},
+    "PP_BEV_FC": {"fusion": "fc", "lidar": "pp", "camera": "bev"},
+    "RV_WOB_TR_LARGE": {"many_tokens": True},
+    "RV_WOB_TR_measurements": {"navigation": True},
+    "RV_BEV_FC_measurements": {"fusion": "fc", "camera": "bev", "navigation": True},
+    "2d_RV_WOB_TR_voxel": {"latent": "2d", "heads": config_lib.HEADS},
+    "2d_RV_BEV_TR": {"latent": "2d", "camera": "bev"},
+    "2d_PP_WOB_TR": {"latent": "2d", "lidar": "pp"},
+    "2d_measurements": {"latent": "2d", "navigation": True},
+    "2d_mobilevit": {"latent": "2d", "backbone": "mobilevitv2_100", "heads": config_lib.HEADS},
+}
+
+
+def reference_config(name):
+    return config_lib.ModelConfig(numerics="reference", **{"heads": LIDAR_ONLY, **VARIANTS[name]})
+
+
+@pytest.mark.parametrize("name", VARIANTS)
+def test_parameters_match_one_to_one(name):
+    config = reference_config(name)
+    leaves = jax.tree_util.tree_flatten_with_path(world_model.WorldModel(config).variable_shapes())[0]
+    ours = {}
+    for path, leaf in leaves:
+        path = "/".join(part.key for part in path[1:])
+        key = names.reference_key(path)
+        assert key not in ours
+        ours[key] = math.prod(names.reference_shape(path, leaf.shape))
+    unused = "num_batches_tracked|encoder_layer|transformer_decoder_layer|bev_intrinsics"
+    theirs = {key: math.prod(shape) for key, shape in packs.manifest(name).items() if not re.search(unused, key)}
+    assert ours == theirs

@@ -1,0 +1,80 @@
+"""A sealed model runs where muvo_jax cannot be imported, and gives the same numbers."""
+
+import dataclasses
+import json
+import subprocess
+import sys
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from muvo_jax import export, presets
+from muvo_jax.model import live, rollout, world_model
+
+PROGRAM = """
+import json, pathlib, sys
+sys.modules["muvo_jax"] = None  # an import of it would fail
+import jax, jax.export, numpy as np
+from safetensors.numpy import load_file
+folder = pathlib.Path(sys.argv[1])
+weights = load_file(folder / "weights.safetensors")
+given = dict(np.load(folder / "given.npz"))
+call = lambda name, *args: jax.export.deserialize(bytearray((folder / f"{name}.bin").read_bytes())).call(weights, *args)
+part = lambda prefix: {name[len(prefix):]: value for name, value in given.items() if name.startswith(prefix)}
+seen = call("observe_step", part("live/"), part("observation/"), given["previous_action"])
+state = {name: seen[name] for name in ("deterministic", "stochastic")}
+dream = call("imagine", given["keys"], state, given["actions"], np.float32(1))
+last = {name: value[:, -1] for name, value in dream.items()}
+np.savez(folder / "out.npz", frame=seen["frame"], **dream, action=call("decode_action", last))
+"""
+
+
+def test_a_sealed_model_gives_the_same_numbers_without_the_library(tmp_path):
+    pytest.importorskip("flatbuffers", reason="flatbuffers (extra [export]) is not installed")
+    pytest.importorskip("safetensors", reason="safetensors (extra [export]) is not installed")
+    config = presets.get("tiny")
+    config = dataclasses.replace(config, model=dataclasses.replace(config.model, heads=("action",)))
+    model = world_model.WorldModel(config.model)
+    variables = jax.tree.map(jnp.asarray, model.init(jax.random.key(0)))
+    written = export.seal(model, variables, config, tmp_path, horizon=3)
+    assert {path.name for path in written} == {
+        "observe_step.bin", "imagine.bin", "decode_action.bin", "weights.safetensors", "config.json", "contract.json",
+        "signatures.json"}
+    signatures = json.loads((tmp_path / "signatures.json").read_text())
+    assert signatures["functions"]["imagine"]["arguments"][2] == "float32[b, 3, 2]"
+    assert json.loads((tmp_path / "contract.json").read_text())["wheelbase_m"] == config.contract.wheelbase_m
+
+    random = np.random.default_rng(0)
+    stream = live.start_live(model, jax.random.key(1), 3)
+    observation = {name: random.uniform(0, 20, (3, *leaf.shape)).astype(leaf.dtype)
+                   for name, leaf in export.inputs(config).items()}
+    keys = jax.random.split(jax.random.key(2), 3)
+    actions = random.uniform(-1, 1, (3, 3, 2)).astype(np.float32)
+    given = {"previous_action": np.zeros((3, 2), np.float32), "actions": actions, "keys": jax.random.key_data(keys),
+             "live/keys": jax.random.key_data(stream.keys), "live/frame": stream.frame}
+    given |= {f"live/{name}": value for name, value in vars(stream.latent).items()}
+    given |= {f"observation/{name}": value for name, value in observation.items()}
+    np.savez(tmp_path / "given.npz", **given)
+    subprocess.run([sys.executable, "-c", PROGRAM, str(tmp_path)], check=True, cwd=tmp_path)
+
+    stream = live.observe_step(model, variables, stream, observation, given["previous_action"])
+    dream = rollout.imagine(model, variables, keys, stream.latent, actions)
+    out = np.load(tmp_path / "out.npz")
+    assert out["frame"].tolist() == [1, 1, 1]
+    np.testing.assert_allclose(out["stochastic"], dream.states.stochastic, atol=1e-4)
+    np.testing.assert_allclose(
+        out["action"], rollout.decode(model, variables, dream.states[:, -1], ("action",))["action"][1], atol=1e-4)
+
+
+def test_flattening_has_an_inverse():
+    tree = {"params": {"a": {"b": 1, "c": 2}}, "batch_stats": {"d": 3}}
+    assert export.flatten(tree) == {"params/a/b": 1, "params/a/c": 2, "batch_stats/d": 3}
+    assert export.unflatten(export.flatten(tree)) == tree
+
+
+def test_a_horizon_of_nothing_is_refused(tmp_path):
+    pytest.importorskip("safetensors", reason="safetensors (extra [export]) is not installed")
+    with pytest.raises(ValueError, match="horizon is 0"):
+        export.seal(world_model.WorldModel(presets.get("tiny").model), {}, presets.get("tiny"), tmp_path, horizon=0)

@@ -96,8 +96,8 @@ def ssim(prediction: jax.Array, target: jax.Array, *, non_negative: bool = False
     def blur(image: jax.Array) -> jax.Array:
         for axis in (1, 2):
             count = image.shape[axis] - _SSIM_SIZE + 1
-            image = sum(line[tap] * jax.lax.slice_in_dim(image, tap, tap + count, axis=axis)
-                        for tap in range(_SSIM_SIZE))
+            image = sum((line[tap] * jax.lax.slice_in_dim(image, tap, tap + count, axis=axis)
+                         for tap in range(_SSIM_SIZE)), jnp.float32(0.0))
         return image
 
     mean_p, mean_t = blur(prediction), blur(target)

@@ -45,6 +45,36 @@ def depth_to_points(depth_m: np.ndarray, intrinsics: np.ndarray, camera_to_ego: 
     return camera @ camera_to_ego[:3, :3].T.astype(np.float32) + camera_to_ego[:3, 3].astype(np.float32)
 
 
+def reference_depth_points(depth_m: np.ndarray, horizontal_fov_rad: float, position_m: tuple[float, float, float], *,
+                           far_m: float = 1000.0, range_m: float = 100.0) -> tuple[np.ndarray, np.ndarray]:
+    """Lifts a depth map as the reference's data tools do: whole pixel coordinates, in float64.
+
+    Args:
+      depth_m: [H, W], along the optical axis, metres.
+      position_m: of the level camera, ego frame.
+      far_m: depths from here on are sky.
+      range_m: points from here on (distance from the camera) are left out.
+
+    Returns:
+      float64 [P, 3], ego frame, metres, row by row, and int64 [P], the flat number of each point's pixel.
+    """
+    height_px, width_px = depth_m.shape
+    depth_m = np.asarray(depth_m, np.float64)
+    focal_px = width_px / (2.0 * np.tan(0.5 * horizontal_fov_rad))
+    right = ((np.arange(width_px) - width_px / 2.0) / focal_px)[None]
+    down = ((np.arange(height_px) - height_px / 2.0) / focal_px)[:, None]
+    # Where a pixel looks decides how deep it may be; so no point is made that is not kept.
+    deepest_m = np.minimum(far_m, range_m / np.sqrt(1.0 + right * right + down * down))
+    pixel = np.flatnonzero(depth_m.reshape(-1) < deepest_m.reshape(-1))
+    row, column = np.divmod(pixel.astype(np.int32), np.int32(width_px))
+    depth = depth_m.reshape(-1)[pixel]
+    points_m = np.empty((len(pixel), 3))
+    points_m[:, 0] = depth + position_m[0]
+    points_m[:, 1] = position_m[1] - right[0][column] * depth
+    points_m[:, 2] = position_m[2] - down[:, 0][row] * depth
+    return points_m, pixel
+
+
 def project_to_image(points_m: np.ndarray, intrinsics: np.ndarray,
                      camera_to_ego: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Projects points [P, 3] (ego frame, m) into the image.

@@ -13,6 +13,9 @@ import numpy as np
 from muvo_jax import config as config_lib
 
 NO_RETURN_M = -1.0
+_SCATTER_ROUNDS = 8
+# Above the error of float32 angles in pixels: 4e-7 rad times columns / (2 pi) or rows / (field of view).
+_EDGE_PX = 2e-3
 
 
 def check_points(points_m: np.ndarray, name: str = "points_m") -> np.ndarray:
@@ -45,27 +48,76 @@ def project(points_m: np.ndarray, geometry: config_lib.RangeViewGeometry) -> np.
       ValueError: for another shape or for points that are not finite.
     """
     points_m = check_points(points_m)
-    # In float64: two points on one ring of flat ground differ in range by less than float32 tells, and one must win.
-    relative_m = points_m - np.asarray(geometry.position_m, np.float64)[None]
-    range_m = np.sqrt(np.einsum("pc,pc->p", relative_m, relative_m))
-    here = range_m > 0
-    points_m, relative_m, range_m = points_m[here], relative_m[here], range_m[here]
-
-    x, y, z = relative_m.astype(np.float32).T
-    yaw_rad = np.arctan2(y, x)
-    elevation_rad = np.arcsin(np.clip(z / range_m.astype(np.float32), -1.0, 1.0))
-    span_rad = geometry.elevation_max_rad - geometry.elevation_min_rad
-    column = np.floor(0.5 * (1.0 - yaw_rad / np.float32(np.pi)) * geometry.columns).astype(np.int64)
-    row = np.floor((1.0 - (elevation_rad - geometry.elevation_min_rad) / span_rad) * geometry.rows).astype(np.int64)
-    pixel = (np.clip(row, 0, geometry.rows - 1) * geometry.columns + np.clip(column, 0, geometry.columns - 1))
-
-    image = np.zeros((geometry.rows * geometry.columns, 4), np.float32)
+    winner, range_m = _nearest(points_m, geometry)
+    image = np.zeros((len(winner), 4), np.float32)
     image[:, 3] = NO_RETURN_M
-    # NumPy keeps the last of repeated assignments, so the nearest point comes last.
-    order = np.argsort(-range_m, kind="stable")
-    image[pixel[order], :3] = points_m[order]
-    image[pixel[order], 3] = range_m[order]
+    hit = np.flatnonzero(winner >= 0)
+    point = winner[hit]
+    image[hit, :3] = points_m[point]
+    image[hit, 3] = range_m[point]
     return image.reshape(geometry.rows, geometry.columns, 4)
+
+
+def nearest_points(points_m: np.ndarray, geometry: config_lib.RangeViewGeometry) -> np.ndarray:
+    """Returns the number of the point that `project` shows in each pixel, int32 [rows, columns], -1 where empty.
+
+    It gathers whatever else belongs to the points, such as their classes. Of points at exactly one distance the last
+    wins.
+
+    Raises:
+      ValueError: for another shape or for points that are not finite.
+    """
+    return _nearest(check_points(points_m), geometry)[0].reshape(geometry.rows, geometry.columns)
+
+
+def nearest_of_cells(cell: np.ndarray, distance: np.ndarray, cells: int) -> np.ndarray:
+    """Returns the nearest point of each cell, int32 [cells], -1 where it has none; of equals the last wins.
+
+    Sorting the points costs most of a projection, and few cells hold more than a handful. So points are scattered, and
+    those nearer than the winner of their cell are scattered again; what is left after a few rounds is sorted.
+
+    Args:
+      cell: integers [P] in [0, cells); negative ones count for nothing.
+      distance: floats [P], or anything that grows with it.
+    """
+    winner = np.full(cells, -1, np.int32)
+    point = np.flatnonzero(cell >= 0).astype(np.int32)
+    for _ in range(_SCATTER_ROUNDS):
+        winner[cell[point]] = point
+        point = point[distance[point] < distance[winner[cell[point]]]]
+        if not point.size:
+            return winner
+    # NumPy keeps the last of repeated assignments, so the nearest point comes last, and of equals the last of all.
+    point = point[np.argsort(-distance[point], kind="stable")]
+    winner[cell[point]] = point
+    return winner
+
+
+def _nearest(points_m: np.ndarray, geometry: config_lib.RangeViewGeometry) -> tuple[np.ndarray, np.ndarray]:
+    """Point number of each pixel, int32 [rows * columns], and the float64 range of each point, m."""
+    # In float64: two points on one ring of flat ground differ in range by less than float32 tells, and one must win.
+    x, y, z = (points_m[:, axis] - np.float64(geometry.position_m[axis]) for axis in range(3))
+    range_m = np.sqrt(x * x + y * y + z * z)
+    image = np.stack(_image_coordinates(x.astype(np.float32), y.astype(np.float32), z.astype(np.float32), geometry))
+    whole = np.floor(image)
+    # float32 angles decide all but the points at the edge of a pixel, which are taken again in float64.
+    at_edge = np.abs(image - whole - np.float32(0.5)) > np.float32(0.5 - _EDGE_PX)
+    edge = np.flatnonzero(at_edge[0] | at_edge[1])
+    whole[:, edge] = np.floor(_image_coordinates(x[edge], y[edge], z[edge], geometry))
+    row, column = whole.astype(np.int32)
+    pixel = np.minimum(np.maximum(row, 0), geometry.rows - 1) * np.int32(geometry.columns)
+    pixel += np.minimum(np.maximum(column, 0), geometry.columns - 1)
+    pixel[range_m == 0] = -1
+    return nearest_of_cells(pixel, range_m, geometry.rows * geometry.columns), range_m
+
+
+def _image_coordinates(x: np.ndarray, y: np.ndarray, z: np.ndarray,
+                       geometry: config_lib.RangeViewGeometry) -> tuple[np.ndarray, np.ndarray]:
+    """Continuous (row, column) of points relative to the lidar, in their dtype."""
+    elevation_rad = np.arctan2(z, np.sqrt(x * x + y * y))
+    span_rad = geometry.elevation_max_rad - geometry.elevation_min_rad
+    row = (1.0 - (elevation_rad - geometry.elevation_min_rad) / span_rad) * geometry.rows
+    return row, 0.5 * (1.0 - np.arctan2(y, x) / np.pi) * geometry.columns
 
 
 def to_points(range_view: np.ndarray, threshold_m: float = 0.0) -> np.ndarray:

@@ -32,6 +32,53 @@ def voxelize(points_m: np.ndarray, grid: config_lib.VoxelGrid) -> np.ndarray:
     return occupied.reshape(grid.shape)
 
 
+def voxel_table(points_m: np.ndarray, tags: np.ndarray, grid: config_lib.VoxelGrid, *,
+                winning_tag: int | None = None) -> np.ndarray:
+    """Lists the occupied voxels, each with the tag of its point nearest to the voxel's LOWER CORNER, in float64.
+
+    That is how the authors' generate_voxels labels (its comment says centre); of points at exactly one distance the
+    last wins here, any in their code, which sorts unstably.
+
+    Args:
+      points_m: [P, 3], ego frame, metres, in float32 or float64; points outside the grid count for nothing.
+      tags: unsigned [P].
+      winning_tag: a tag that labels a voxel however far from the corner its point lies (the authors': road line).
+
+    Returns:
+      uint16 [M, 4]: ix, iy, iz, tag, sorted by z, then y, then x.
+
+    Raises:
+      ValueError: for another shape or for points that are not finite.
+    """
+    points_m = np.asarray(points_m)
+    range_view.check_points(points_m)
+    if np.shape(tags) != points_m.shape[:1]:
+        raise ValueError(f"tags: got shape {np.shape(tags)}, expected one for each of {len(points_m)} points.")
+    number = np.zeros(len(points_m), np.int32)
+    inside = np.ones(len(points_m), bool)
+    to_corner = np.zeros(len(points_m))  # squared, in voxels
+    for axis in (2, 1, 0):
+        place = (points_m[:, axis] - np.float64(grid.origin_m[axis])) / grid.voxel_size_m
+        index = np.floor(place)
+        inside &= (index >= 0) & (index < grid.shape[axis])
+        place -= index
+        to_corner += place * place
+        # Far coordinates would overflow; what is outside is masked in the end.
+        number = number * np.int32(grid.shape[axis]) + np.clip(index, 0, grid.shape[axis]).astype(np.int32)
+    number[~inside] = -1
+    winner = range_view.nearest_of_cells(number, to_corner, int(np.prod(grid.shape)))
+    voxel = np.flatnonzero(winner >= 0)
+    tag = np.asarray(tags)[winner[voxel]].astype(np.uint16)
+    if winning_tag is not None:
+        has_winning = np.zeros(len(winner), bool)
+        has_winning[number[inside & (tags == winning_tag)]] = True
+        tag[has_winning[voxel]] = winning_tag
+    columns, rows, _ = grid.shape
+    plane, ix = np.divmod(voxel.astype(np.int32), np.int32(columns))
+    iz, iy = np.divmod(plane, np.int32(rows))
+    return np.stack([ix, iy, iz, tag], axis=1).astype(np.uint16)
+
+
 def voxel_index(points_m: np.ndarray, grid: config_lib.VoxelGrid) -> tuple[np.ndarray, np.ndarray]:
     """Returns the voxel of each point, int32 [P, 3], and whether it lies inside the grid, bool [P]."""
     index = np.floor(_in_voxels(points_m, grid)).astype(np.int32).T

@@ -5,6 +5,7 @@ from hypothesis import strategies as st
 
 from muvo_jax import config as config_lib
 from muvo_jax.ops import range_view
+from tests.golden_rule import Golden, make_input
 
 GEOMETRY = config_lib.RangeViewGeometry(rows=64, columns=256)
 LIDAR_M = np.array(GEOMETRY.position_m, np.float32)
@@ -87,3 +88,39 @@ def test_of_two_points_at_almost_one_distance_the_nearer_wins():
     for order in ((near, far), (far, near)):
         image = range_view.project(np.concatenate(order), config_lib.RangeViewGeometry(rows=1, columns=1))
         np.testing.assert_array_equal(image[0, 0, :3], near[0])
+
+
+def test_agrees_with_the_reference():
+    """Pack P2: 60 000 points into 64 x 1024, every pixel; classes where no duplicate of the point has another one."""
+    golden = Golden("p2_geometry.npz")
+    points_m = make_input("rv_cloud", (60000,), "cloud")
+    classes = make_input("rv_sem", (60000,), "ints9")
+    geometry = config_lib.RangeViewGeometry()
+    image = range_view.project(points_m, geometry)
+    np.testing.assert_allclose(image[..., 3], golden["range/depth"], atol=2e-5)
+    assert golden.error("range/xyz", image[..., :3]) < 1e-5
+    nearest = range_view.nearest_points(points_m, geometry)
+    shown = np.where(nearest >= 0, classes[nearest], 0)
+    sure = ~golden["range/label_ambiguous"]
+    np.testing.assert_array_equal(shown[sure], golden["range/sem"][sure])
+
+
+def test_many_points_in_one_pixel():
+    """More than the rounds of scattering: the rest is sorted. From near to far is the worst order."""
+    for steps in (np.arange(1, 101), np.arange(100, 0, -1)):
+        points_m = LIDAR_M + np.stack([steps, 0 * steps, 0 * steps], axis=1).astype(np.float32)
+        nearest = range_view.nearest_points(points_m, GEOMETRY)
+        assert nearest[nearest >= 0].tolist() == [int(np.argmin(steps))]
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.integers(0, 2**31), st.integers(1, 400), st.integers(1, 20))
+def test_nearest_of_cells_is_the_last_of_the_nearest(seed, count, cells):
+    rng = np.random.default_rng(seed)
+    cell, distance = rng.integers(-1, cells, count), rng.integers(0, 30, count).astype(np.float64)
+    expected = np.full(cells, -1)
+    for point in range(count):
+        best = expected[cell[point]]
+        if cell[point] >= 0 and (best < 0 or distance[point] <= distance[best]):
+            expected[cell[point]] = point
+    np.testing.assert_array_equal(range_view.nearest_of_cells(cell, distance, cells), expected)

@@ -4,7 +4,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from muvo_jax import config as config_lib
-from muvo_jax.ops import voxels
+from muvo_jax.data import carla_files
+from muvo_jax.ops import camera, voxels
+from tests.golden_rule import Golden, make_input
 
 GRID = config_lib.VoxelGrid(shape=(8, 6, 4), voxel_size_m=0.5, origin_m=(-2.0, -1.0, 0.0))
 
@@ -96,3 +98,44 @@ def test_points_that_are_not_finite_are_refused():
         voxels.voxelize(np.array([[np.nan, 0, 0]]), GRID)
     with pytest.raises(ValueError, match="NaN or infinite"):
         voxels.carve(np.zeros(3), np.array([[np.inf, 0, 0]]), GRID)
+
+
+def test_voxel_table_labels_by_the_point_nearest_to_the_lower_corner():
+    points_m = [[-1.9, -0.9, 0.1], [-1.6, -0.6, 0.4], [0.1, 0.1, 0.1], [0.3, 0.3, 0.3], [1.9, 1.9, 1.9], [50, 0, 0]]
+    tags = np.array([1, 2, 3, 6, 4, 5], np.uint8)
+    plain = [[0, 0, 0, 1], [4, 2, 0, 3], [7, 5, 3, 4]]
+    assert voxels.voxel_table(np.array(points_m), tags, GRID).tolist() == plain
+    plain[1][3] = 6  # a road line wins from anywhere in the voxel
+    assert voxels.voxel_table(np.array(points_m), tags, GRID, winning_tag=6).tolist() == plain
+
+
+def test_voxel_table_is_empty_without_points_and_wants_a_tag_for_each():
+    assert voxels.voxel_table(np.zeros((0, 3)), np.zeros(0, np.uint8), GRID).shape == (0, 4)
+    with pytest.raises(ValueError, match="one for each of 2 points"):
+        voxels.voxel_table(np.zeros((2, 3)), np.zeros(3, np.uint8), GRID)
+
+
+def test_voxels_of_depth_and_lidar_agree_with_the_reference():
+    """Pack P2: 600 x 960 depth and 60 000 points, without the car's own; every voxel and every tag."""
+    golden = Golden("p2_geometry.npz")
+    depth_m = make_input("vf_depth", (600, 960), "depth_m")
+    of_pixels = make_input("vf_sem", (600, 960), "labels23").reshape(-1)
+    lidar_m = make_input("rv_cloud", (60000,), "cloud")
+    seen_m, pixel = camera.reference_depth_points(depth_m, np.deg2rad(110), (1.0, 0.0, 2.0))
+    points_m = np.concatenate([seen_m, lidar_m])
+    tags = np.concatenate([of_pixels[pixel], make_input("vf_lsem", (60000,), "ints23")])
+    kept = ~carla_files.in_ego_box(points_m)
+    assert golden.error("merge/points", points_m[kept]) < 1e-5
+    table = voxels.voxel_table(points_m[kept], tags[kept], config_lib.VoxelGrid(), winning_tag=6)
+    np.testing.assert_array_equal(table[:, :3], golden["voxel_filter/coords"])
+    sure = ~golden["voxel_filter/label_ambiguous"]
+    np.testing.assert_array_equal(table[sure, 3], golden["voxel_filter/sem"][sure])
+
+
+def test_depth_points_agree_with_the_reference():
+    golden = Golden("p2_geometry.npz")
+    depth_m = make_input("d2p_depth", (60, 96), "depth_m")
+    points_m, pixel = camera.reference_depth_points(depth_m, np.deg2rad(110), (1.0, 0.0, 2.0))
+    assert golden.error("convert_coor_img", points_m) < 1e-5
+    classes = make_input("d2p_sem", (60, 96), "ints23").reshape(-1)
+    np.testing.assert_array_equal(classes[pixel], golden["depth2pcd/sem"][:, 0])

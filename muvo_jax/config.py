@@ -226,6 +226,7 @@ class DataConfig:
 
     Attributes:
       path: "town" (the built-in world) or a folder of recordings.
+      camera: which one, where a recording has several (KITTI: image_00 to image_03); "" is the reader's choice.
       frames, stride: a training window is `frames` frames, each `stride` recorded frames apart.
       context, horizon: evaluation observes `context` frames and imagines `horizon` more.
       town_seed, town_size: which town, and how much of it ("default", "tiny").
@@ -234,6 +235,7 @@ class DataConfig:
     """
 
     path: str = "town"
+    camera: str = ""
     frames: int = 12
     stride: int = 2
     context: int = 6

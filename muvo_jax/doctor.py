@@ -31,6 +31,8 @@ class Options:
     """Folder of a recording."""
     out: Annotated[pathlib.Path | None, command_line.shown("FOLDER", "doctor/NAME")] = None
     """Where the report goes."""
+    camera: Annotated[str, command_line.shown("NAME", "the reader's choice")] = ""
+    """Which camera, where the recording has several (KITTI: image_00 to image_03)."""
     frames: int = 600
     """How many frames to read, spread over the recording; 0 reads all."""
 
@@ -53,7 +55,7 @@ def examine(options: Options, show: screen.Screen) -> checkup.Checkup:
       DataError: where the folder cannot be opened at all.
       RecordingProblems: where something should be mended, after everything has been written.
     """
-    recording, warned = open_recording(options.path)
+    recording, warned = open_recording(options.path, options.camera)
     with show.counter("looking at", "frames") as progress:
         result = checkup.examine(recording, warned, frames=options.frames, progress=progress)
     out = options.out or pathlib.Path("doctor") / recording.description.name.split(",")[0]
@@ -70,11 +72,11 @@ def examine(options: Options, show: screen.Screen) -> checkup.Checkup:
     return result
 
 
-def open_recording(path: pathlib.Path) -> tuple[schema.Recording, list[str]]:
+def open_recording(path: pathlib.Path, camera: str = "") -> tuple[schema.Recording, list[str]]:
     """The recording and what opening it warned of."""
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        recording = sources.open_recording(path)
+        recording = sources.open_recording(path, camera=camera)
     return recording, [str(warning.message) for warning in caught if issubclass(warning.category, schema.DataWarning)]
 
 

@@ -20,10 +20,10 @@ from muvo_jax.viz import curves, sheets
 
 # Flags that change one field of the configuration.
 _FIELDS = {"lidar": "model.lidar", "camera": "model.camera", "fusion": "model.fusion", "latent": "model.latent",
-           "backbone": "model.backbone", "data": "data.path", "steps": "train.steps", "batch": "train.batch",
-           "accumulate": "optimizer.accumulate", "frames": "data.frames", "stride": "data.stride",
-           "context": "data.context", "horizon": "data.horizon", "learning_rate": "optimizer.learning_rate",
-           "seed": "train.seed", "parallel": "train.parallel"}
+           "backbone": "model.backbone", "data": "data.path", "data_camera": "data.camera", "steps": "train.steps",
+           "batch": "train.batch", "accumulate": "optimizer.accumulate", "frames": "data.frames",
+           "stride": "data.stride", "context": "data.context", "horizon": "data.horizon",
+           "learning_rate": "optimizer.learning_rate", "seed": "train.seed", "parallel": "train.parallel"}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -56,6 +56,8 @@ class Options:
     """Predict no occupancy."""
     data: Annotated[str | None, command_line.shown("PATH")] = None
     """"town" (built in) or the folder of a recording; its kind is recognised."""
+    data_camera: Annotated[str | None, command_line.shown("NAME", "the reader's choice")] = None
+    """Which camera of the recording, where it has several (KITTI: image_00 to image_03)."""
     name: Annotated[str | None, command_line.shown("NAME", "made of data, preset and fusion")] = None
     """Of the run."""
     runs_dir: pathlib.Path = pathlib.Path("runs")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pathlib
 import struct
+import tokenize
 import tomllib
 import warnings
 import zipfile
@@ -20,6 +21,10 @@ GAP_PERIODS = 1.5  # a time step longer than this many periods is a gap
 # Pillow raises any of these for broken chunks and for sizes that would fill the memory.
 _IMAGE_ERRORS = (OSError, SyntaxError, ValueError, TypeError, IndexError, OverflowError, MemoryError, zlib.error,
                  struct.error, Image.DecompressionBombError)
+# Of damaged archives; the last ones come from Python's parser, with which NumPy reads headers.
+_ARCHIVE_ERRORS = (OSError, ValueError, EOFError, zipfile.BadZipFile, zlib.error, struct.error, KeyError, IndexError,
+                   TypeError, OverflowError, MemoryError, RecursionError, NotImplementedError, RuntimeError,
+                   SyntaxError, tokenize.TokenError)
 
 
 def read_image(path: pathlib.Path, mode: str | None) -> np.ndarray:
@@ -53,7 +58,7 @@ def read_npz(path: pathlib.Path, name: str) -> np.ndarray:
         raise missing(path, f"an NPZ file with {name!r}") from error
     except schema.DataError:
         raise
-    except (OSError, ValueError, EOFError, zipfile.BadZipFile, zlib.error) as error:
+    except _ARCHIVE_ERRORS as error:
         raise schema.DataError(f"{path}: not a readable NPZ file ({error}). The file is truncated or damaged: copy it "
                                f"again, or delete it so that the sequence is split there.") from error
 
@@ -64,7 +69,7 @@ def read_toml(path: pathlib.Path) -> dict:
         return tomllib.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError as error:
         raise missing(path, "a TOML description") from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
         raise schema.DataError(f"{path}: not valid TOML ({error}).") from error
 
 

@@ -1,7 +1,8 @@
 """KITTI raw folders (Geiger et al., IJRR 2013), read where they are.
 
 Layout: <date>/calib_*.txt and <date>/<date>_drive_NNNN_sync/{image_02,velodyne_points,oxts}/data/NNNNNNNNNN.*, with
-image_02/timestamps.txt. The path may be the folder of dates, a date or a drive.
+image_02/timestamps.txt. The path may be the folder of dates, a date or a drive. Camera images or scans may be missing
+altogether; oxts may not, since actions come from it. image_00 and image_01 are grey, image_02 and image_03 colour.
 
 Ego frame: x forward, y left, z up, origin on the ground under the lidar, which sits 1.73 m above the ground (the
 velodyne axes point the same way, so a point only moves up by 1.73 m). The IMU's own place does not matter: only its
@@ -19,6 +20,7 @@ import datetime
 import math
 import pathlib
 import re
+import warnings
 
 import numpy as np
 
@@ -41,10 +43,14 @@ _NOTE_SPLITS = ("KITTI: the first two thirds of each drive train, the last third
 _NOTE_ACTIONS = "KITTI: actions are derived from speed, acceleration and yaw rate (bicycle model), not recorded."
 
 
+CAMERAS = ("image_00", "image_01", "image_02", "image_03")
+_SUFFIXES = {"velodyne_points": ".bin", "oxts": ".txt"}
+
+
 @dataclasses.dataclass(frozen=True)
 class _Drive:
     folder: pathlib.Path
-    camera: schema.Camera
+    camera: schema.Camera | None
     frame_ids: np.ndarray  # int64 [F], every number from the first frame of any sensor to the last
     absent: dict[str, int]  # sensor -> how many of frame_ids it lacks
     present: np.ndarray  # bool [F], whether all sensors have the frame
@@ -69,31 +75,53 @@ def derive_action(speed_mps: float, acceleration_mps2: float, yaw_rate_radps: fl
 
 
 class KittiRecording:
-    """The drives under a path as one recording; `camera` is the folder of images used, image_02 (left colour)."""
+    """The drives under a path as one recording, seen by one of its cameras."""
 
     def __init__(self, path: pathlib.Path | str, camera: str = "image_02"):
         """Reads calibration and time stamps and looks which frames exist; frames themselves are read by `read`.
 
+        Args:
+          path: of a drive, a date or the folder of dates.
+          camera: one of CAMERAS.
+
         Raises:
-          DataError: where there is no drive, or a drive lacks calibration, a sensor or time stamps.
+          DataError: where there is no drive, no drive has oxts and another sensor, or one lacks calibration or time
+            stamps; for a camera that KITTI does not have.
         """
         path = pathlib.Path(path)
+        if camera not in CAMERAS:
+            raise schema.DataError(f"KITTI has no camera {camera!r}; it has {', '.join(CAMERAS)}.")
         folders = find_drives(path)
         if not folders:
             raise files.missing(path / "<date>_drive_NNNN_sync", "a KITTI raw drive")
-        self._sensors = {camera: ".png", "velodyne_points": ".bin", "oxts": ".txt"}
-        self._drives = {folder.resolve().name: _open_drive(folder, self._sensors) for folder in folders}
+        self._camera = camera
+        sensors = {camera: ".png", **_SUFFIXES}
+        self._sensors = {sensor: suffix for sensor, suffix in sensors.items()
+                         if sensor == "oxts" or any(_has(folder, sensor, suffix) for folder in folders)}
+        others = [name for name in CAMERAS if any(_has(folder, name, ".png") for folder in folders)]
+        if camera not in self._sensors and (others or len(self._sensors) < 2):
+            raise schema.DataError(f"{path}: no drive has frames of {camera}; there are "
+                                   f"{', '.join(others) or 'none'} of other cameras. Unpack the synced drives, or "
+                                   f"name a camera that is there.")
+        whole = [folder for folder in folders
+                 if all(_has(folder, sensor, suffix) for sensor, suffix in self._sensors.items())]
+        if not whole:
+            raise _lacking(folders[0], self._sensors)
+        for folder in sorted(set(folders) - set(whole)):
+            warnings.warn(f"{_lacking(folder, self._sensors)} The drive is left out.", schema.DataWarning, stacklevel=2)
+        self._drives = {folder.resolve().name: _open_drive(folder, self._sensors) for folder in whole}
         steps = np.concatenate([np.diff(drive.timestamps_s) for drive in self._drives.values()])
         period_s = float(np.nanmedian(steps)) if np.isfinite(steps).any() else 1.0 / CONTRACT.rate_hz
         rate_hz = round(1.0 / period_s, 1)
         self.sequences = tuple(sequence for drive in self._drives.values()
                                for sequence in _cut(drive, period_s))
+        modalities = {"speed_mps", "yaw_rate_radps", "action", "timestamp_s", "frame_id"}
+        modalities |= {"image", "intrinsics", "camera_to_ego"} if camera in self._sensors else set()
+        modalities |= {"points_m"} if "velodyne_points" in self._sensors else set()
         self.description = schema.RecordingDescription(
             name=", ".join(self._drives), kind="KITTI raw", rate_hz=rate_hz,
-            camera=next(iter(self._drives.values())).camera, lidar=LIDAR, voxels=None,
-            contract=dataclasses.replace(CONTRACT, rate_hz=rate_hz),
-            modalities=frozenset(("image", "intrinsics", "camera_to_ego", "points_m", "speed_mps",
-                                  "yaw_rate_radps", "action", "timestamp_s", "frame_id")),
+            camera=next(iter(self._drives.values())).camera, lidar=LIDAR if "points_m" in modalities else None,
+            voxels=None, contract=dataclasses.replace(CONTRACT, rate_hz=rate_hz), modalities=frozenset(modalities),
             splits=("train", "val"), notes=(_NOTE_SPLITS, _NOTE_ACTIONS))
 
     def read(self, sequence: schema.Sequence, index: int) -> schema.RawFrame:
@@ -101,25 +129,39 @@ class KittiRecording:
         drive = self._drives[sequence.name]
         position = sequence.start + index
         frame_id = int(drive.frame_ids[position])
-        image_path, points_path, oxts_path = (drive.folder / sensor / "data" / f"{frame_id:010d}{suffix}"
-                                              for sensor, suffix in self._sensors.items())
-        image = files.read_image(image_path, "RGB")
-        if image.shape[:2] != (drive.camera.height_px, drive.camera.width_px):
-            raise schema.DataError(f"{image_path}: {image.shape[1]}x{image.shape[0]} pixels, but the calibration "
-                                   f"(S_rect) is for {drive.camera.width_px}x{drive.camera.height_px}. Use rectified "
-                                   f"(synced) images, or scale P_rect and S_rect with them.")
-        speed_mps, acceleration_mps2, yaw_rate_radps = read_oxts(oxts_path)
-        return {
-            "image": image,
-            "intrinsics": np.asarray(drive.camera.intrinsics, np.float32),
-            "camera_to_ego": np.asarray(drive.camera.camera_to_ego, np.float32),
-            "points_m": read_scan(points_path),
+        paths = {sensor: drive.folder / sensor / "data" / f"{frame_id:010d}{suffix}"
+                 for sensor, suffix in self._sensors.items()}
+        speed_mps, acceleration_mps2, yaw_rate_radps = read_oxts(paths["oxts"])
+        frame: schema.RawFrame = {
             "speed_mps": np.float32(speed_mps),
             "yaw_rate_radps": np.float32(yaw_rate_radps),
             "action": derive_action(speed_mps, acceleration_mps2, yaw_rate_radps, self.description.contract),
             "timestamp_s": np.float64(drive.timestamps_s[position]),
             "frame_id": np.int64(frame_id),
         }
+        if drive.camera is not None:
+            image = files.read_image(paths[self._camera], "RGB")
+            if image.shape[:2] != (drive.camera.height_px, drive.camera.width_px):
+                raise schema.DataError(f"{paths[self._camera]}: {image.shape[1]}x{image.shape[0]} pixels, but the "
+                                       f"calibration (S_rect) is for {drive.camera.width_px}x{drive.camera.height_px}. "
+                                       f"Use rectified (synced) images, or scale P_rect and S_rect with them.")
+            frame["image"] = image
+            frame["intrinsics"] = np.asarray(drive.camera.intrinsics, np.float32)
+            frame["camera_to_ego"] = np.asarray(drive.camera.camera_to_ego, np.float32)
+        if "velodyne_points" in paths:
+            frame["points_m"] = read_scan(paths["velodyne_points"])
+        return frame
+
+
+def _has(folder: pathlib.Path, sensor: str, suffix: str) -> bool:
+    return bool(files.numbered(folder / sensor / "data", suffix))
+
+
+def _lacking(folder: pathlib.Path, sensors: dict[str, str]) -> schema.DataError:
+    """What the first missing sensor of a drive should have been."""
+    sensor, suffix = next((name, suffix) for name, suffix in sensors.items() if not _has(folder, name, suffix))
+    return files.missing(folder / sensor / "data" / f"0000000000{suffix}",
+                         f"the {sensor} frames of the drive (unpack the synced drive)")
 
 
 def read_scan(path: pathlib.Path) -> np.ndarray:
@@ -152,7 +194,7 @@ def read_oxts(path: pathlib.Path) -> tuple[float, float, float]:
     if not path.is_file():
         raise files.missing(path, "the motion of the frame (oxts)")
     try:
-        values = [float(word) for word in path.read_text().split()]
+        values = [float(word) for word in path.read_text(encoding="utf-8").split()]
     except ValueError as error:
         raise schema.DataError(f"{path}: not a line of numbers ({error}).") from error
     if len(values) < _OXTS_COLUMNS or not all(map(math.isfinite, values)):
@@ -185,6 +227,13 @@ def read_camera(date_folder: pathlib.Path, number: str) -> schema.Camera:
                          camera_to_ego=_rows(camera_to_ego))
 
 
+def _lines(path: pathlib.Path) -> list[str]:
+    try:
+        return path.read_text(encoding="utf-8").splitlines()
+    except UnicodeDecodeError as error:
+        raise schema.DataError(f"{path}: not a text file ({error}). Unpack it again.") from error
+
+
 def _rigid(rotation: np.ndarray, translation: np.ndarray) -> np.ndarray:
     return np.block([[rotation, translation[:, None]], [np.zeros((1, 3)), np.ones((1, 1))]])
 
@@ -196,7 +245,7 @@ def _rows(matrix: np.ndarray) -> tuple[tuple[float, ...], ...]:
 def _read_calibration(path: pathlib.Path, sizes: dict[str, int]) -> dict[str, np.ndarray]:
     if not path.is_file():
         raise files.missing(path, "the calibration of this date (KITTI offers it as a separate download)")
-    lines = dict(line.split(":", 1) for line in path.read_text().splitlines() if ":" in line)
+    lines = dict(line.split(":", 1) for line in _lines(path) if ":" in line)
     values = {}
     for key, size in sizes.items():
         try:
@@ -210,31 +259,25 @@ def _read_calibration(path: pathlib.Path, sizes: dict[str, int]) -> dict[str, np
 
 
 def _open_drive(folder: pathlib.Path, sensors: dict[str, str]) -> _Drive:
-    camera = next(iter(sensors))
-    numbers = {}
-    for sensor, suffix in sensors.items():
-        data = folder / sensor / "data"
-        numbers[sensor] = files.numbered(data, suffix)
-        if not numbers[sensor]:
-            raise files.missing(data / f"0000000000{suffix}",
-                                f"the {sensor} frames of the drive (unpack the synced drive)")
+    numbers = {sensor: files.numbered(folder / sensor / "data", suffix) for sensor, suffix in sensors.items()}
     every = set().union(*numbers.values())
     frame_ids = np.arange(min(every), max(every) + 1)
     present = np.array([all(frame_id in have for have in numbers.values()) for frame_id in frame_ids.tolist()])
     if not present.any():
         raise schema.DataError(f"{folder}: no frame number is there for all of {', '.join(sensors)}. The folders are "
                                f"of different parts of a drive: unpack it again.")
-    return _Drive(folder=folder, camera=read_camera(folder.resolve().parent, camera.rsplit("_", 1)[-1]),
-                  frame_ids=frame_ids, present=present,
+    first = next(iter(sensors))
+    camera = read_camera(folder.resolve().parent, first.rsplit("_", 1)[-1]) if first in CAMERAS else None
+    return _Drive(folder=folder, camera=camera, frame_ids=frame_ids, present=present,
                   absent={sensor: len(frame_ids) - len(have) for sensor, have in numbers.items()},
-                  timestamps_s=_read_timestamps(folder / camera / "timestamps.txt", frame_ids, present))
+                  timestamps_s=_read_timestamps(folder / first / "timestamps.txt", frame_ids, present))
 
 
 def _read_timestamps(path: pathlib.Path, frame_ids: np.ndarray, present: np.ndarray) -> np.ndarray:
     """Seconds of each frame, NaN where not present; line n of the file (from 0) is frame n."""
     if not path.is_file():
-        raise files.missing(path, "the time stamps of the images")
-    lines = path.read_text().splitlines()
+        raise files.missing(path, f"the time stamps of {path.parent.name}")
+    lines = _lines(path)
     times_s = np.full(len(frame_ids), np.nan)
     for frame_id in frame_ids[present].tolist():
         try:

@@ -2,7 +2,7 @@
 
     ROOT/recording.toml                         what holds for all of it: sensors, voxel grid, action contract
     ROOT/<split>/<run>/frames.csv               one line a frame, written last: a run without it is incomplete
-    ROOT/<split>/<run>/image/000012.png         RGB, 8 bit
+    ROOT/<split>/<run>/image/000012.png         RGB, 8 bit (or .jpg, .jpeg)
     ROOT/<split>/<run>/lidar/000012.npz         points_m float32 [N, 3], ego frame
     ROOT/<split>/<run>/occupancy/000012.npz     occupancy uint8 [X, Y, Z]
     ROOT/<split>/<run>/route_map/000012.png     8 bit
@@ -24,9 +24,9 @@ from muvo_jax.data import description, files, schema
 SCHEMA_VERSION = 1
 DESCRIPTION_FILE = "recording.toml"
 FRAMES_FILE = "frames.csv"
-# RawFrame key -> (folder, suffix) of the modalities that are files.
-_FILES = {"image": ("image", ".png"), "points_m": ("lidar", ".npz"), "occupancy": ("occupancy", ".npz"),
-          "route_map": ("route_map", ".png")}
+# RawFrame key -> (folder, suffixes) of the modalities that are files.
+_FILES = {"image": ("image", (".png", ".jpg", ".jpeg")), "points_m": ("lidar", (".npz",)),
+          "occupancy": ("occupancy", (".npz",)), "route_map": ("route_map", (".png",))}
 _COLUMNS = ("frame_id", "timestamp_s", "speed_mps", "acceleration", "steering")
 _OPTIONAL_COLUMNS = ("reward", "is_terminal", "yaw_rad")
 
@@ -90,7 +90,7 @@ class PlainRecording:
             frame["reward"] = np.float32(columns["reward"][position])
         if "is_terminal" in described.modalities:
             frame["is_terminal"] = np.bool_(columns["is_terminal"][position])
-        paths = {key: run.folder / folder / f"{frame_id:06d}{suffix}" for key, (folder, suffix) in _FILES.items()
+        paths = {key: _path(run.folder / folder, frame_id, suffixes) for key, (folder, suffixes) in _FILES.items()
                  if key in described.modalities}
         if described.camera is not None and "image" in paths:
             camera = described.camera
@@ -111,6 +111,12 @@ class PlainRecording:
         return frame
 
 
+def _path(folder: pathlib.Path, frame_id: int, suffixes: tuple[str, ...]) -> pathlib.Path:
+    """The file of a frame with the first suffix that there is, else with the first."""
+    places = [folder / f"{frame_id:06d}{suffix}" for suffix in suffixes]
+    return next((place for place in places if place.is_file()), places[0])
+
+
 def _check_shape(array: np.ndarray, expected: tuple[int, ...], path: pathlib.Path) -> None:
     if array.shape != expected:
         raise schema.DataError(f"{path}: shape {list(array.shape)}, but {DESCRIPTION_FILE} says {list(expected)}. Do "
@@ -129,10 +135,13 @@ def _read_runs(root: pathlib.Path, split: str) -> list[_Run]:
 
 
 def _read_table(path: pathlib.Path) -> dict[str, np.ndarray]:
-    with path.open(newline="", encoding="utf-8") as file:
-        reader = csv.DictReader(file)
-        rows = list(reader)
-        header = reader.fieldnames or ()
+    try:
+        with path.open(newline="", encoding="utf-8") as file:
+            reader = csv.DictReader(file)
+            rows = list(reader)
+            header = reader.fieldnames or ()
+    except (UnicodeDecodeError, csv.Error) as error:
+        raise schema.DataError(f"{path}: not a CSV table ({error}). Record the run again.") from error
     lacking = [name for name in _COLUMNS if name not in header]
     if lacking:
         raise schema.DataError(f"{path}: column {', '.join(lacking)} is missing; the header has "
@@ -180,9 +189,9 @@ def _cut(run: _Run, name: str, modalities: frozenset[str], period_s: float) -> l
     frame_ids = run.columns["frame_id"].astype(np.int64).tolist()
     absent = {}
     present = np.ones(len(frame_ids), bool)
-    for key, (folder, suffix) in _FILES.items():
+    for key, (folder, suffixes) in _FILES.items():
         if key in modalities:
-            have = files.numbered(run.folder / folder, suffix)
+            have = set().union(*(files.numbered(run.folder / folder, suffix) for suffix in suffixes))
             there = np.array([frame_id in have for frame_id in frame_ids], bool)
             present &= there
             absent[folder] = int((~there).sum())

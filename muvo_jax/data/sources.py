@@ -17,12 +17,14 @@ class Kind(NamedTuple):
       layout: how a folder of this kind is recognised, for messages.
       matches: whether a folder is one.
       open: its reader.
+      cameras: names that `open` takes as its `camera`; empty where a recording has one only.
     """
 
     name: str
     layout: str
     matches: Callable[[pathlib.Path], bool]
-    open: Callable[[pathlib.Path], schema.Recording]
+    open: Callable[..., schema.Recording]
+    cameras: tuple[str, ...] = ()
 
 
 KINDS = (
@@ -31,16 +33,18 @@ KINDS = (
     Kind("plain", f"a folder with {plain.DESCRIPTION_FILE}",
          lambda path: (path / plain.DESCRIPTION_FILE).is_file(), plain.PlainRecording),
     Kind("KITTI raw", "<date>/<date>_drive_NNNN_sync folders, or one of them",
-         lambda path: bool(kitti.find_drives(path)), kitti.KittiRecording),
+         lambda path: bool(kitti.find_drives(path)), kitti.KittiRecording, kitti.CAMERAS),
     Kind("MUVO CARLA", f"trainval/<mode>/<Town>/<run> folders with {carla.FRAME_FILE}, or one of them",
          lambda path: bool(carla.folders(path)), carla.CarlaRecording),
 )
 
 
-def open_recording(path: pathlib.Path | str, *, skip_corrupt_shards: bool = False) -> schema.Recording:
+def open_recording(path: pathlib.Path | str, *, camera: str = "",
+                   skip_corrupt_shards: bool = False) -> schema.Recording:
     """Opens a folder with the reader of its kind (the built-in town is a plain recording in its cache folder).
 
     Args:
+      camera: which one, where the format records several; by default the reader's choice.
       skip_corrupt_shards: of a packed recording; see records.PackedRecording.
 
     Raises:
@@ -59,7 +63,10 @@ def open_recording(path: pathlib.Path | str, *, skip_corrupt_shards: bool = Fals
                                f"world.")
     for kind in KINDS:
         if kind.matches(path):
+            if camera and camera not in kind.cameras:
+                raise schema.DataError(f"{path}: a recording of kind {kind.name} has no camera {camera!r}"
+                                       f"{' but ' + ', '.join(kind.cameras) if kind.cameras else '; it has one only'}.")
             if kind.open is records.PackedRecording and skip_corrupt_shards:
                 return records.PackedRecording(path, corrupt="skip")
-            return kind.open(path)
+            return kind.open(path, camera=camera) if camera else kind.open(path)
     raise schema.DataError(f"data folder {path} is of no known kind. Known are {known}. Found {files.listing(path)}.")

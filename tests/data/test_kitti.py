@@ -3,11 +3,13 @@
 import math
 import os
 import pathlib
+import shutil
 import warnings
 
 import numpy as np
 import pytest
 import recording_writers as writers
+from PIL import Image
 
 from muvo_jax import presets
 from muvo_jax.data import kitti, prepare, schema, sources
@@ -96,6 +98,68 @@ def test_a_jump_in_time_splits_the_sequence(drive):
     assert [(s.start, s.length) for s in recording.sequences] == [(0, 5), (5, 3), (8, 4)]
 
 
+def without(drive, *sensors):
+    for sensor in sensors:
+        shutil.rmtree(drive / sensor)
+
+
+@pytest.mark.parametrize(("absent", "modality"), [("velodyne_points", "points_m"), ("image_02", "image")])
+def test_a_sensor_may_be_missing_altogether(drive, absent, modality):
+    shutil.copy(drive / "image_02/timestamps.txt", drive / "velodyne_points/timestamps.txt")
+    without(drive, absent)
+    recording = sources.open_recording(drive)
+    assert modality not in recording.description.modalities
+    assert modality not in recording.read(recording.sequences[0], 0)
+    assert (recording.description.lidar is None) == (absent == "velodyne_points")
+    assert (recording.description.camera is None) == (absent == "image_02")
+    with pytest.raises(schema.DataError, match=f"lacks .*{modality}"):
+        prepare.adapt(presets.get("tiny"), recording)
+
+
+def test_a_drive_without_image_and_scan_is_refused(drive):
+    without(drive, "image_02", "velodyne_points")
+    with pytest.raises(schema.DataError, match="no drive has frames of image_02"):
+        kitti.KittiRecording(drive)
+
+
+def test_every_camera_can_be_chosen(drive):
+    for number in ("00", "01", "03"):
+        shutil.copytree(drive / "image_02", drive / f"image_{number}")
+        for path in (drive / f"image_{number}/data").iterdir():
+            Image.open(path).convert("L").save(path)  # 00 and 01 are grey
+    calibration = drive.parent / "calib_cam_to_cam.txt"
+    lines = calibration.read_text()
+    for number, shift in (("01", -38.0), ("03", -30.0)):
+        lines += f"S_rect_{number}: 128 48\nP_rect_{number}: 70 0 64 {shift} 0 70 24 0 0 0 1 0\n"
+    calibration.write_text(lines)
+    places = []
+    for camera in kitti.CAMERAS:
+        recording = sources.open_recording(drive, camera=camera)
+        frame = recording.read(recording.sequences[0], 3)
+        assert frame["image"].shape == (48, 128, 3) and (frame["image"] == 30).all()
+        places.append(float(frame["camera_to_ego"][1, 3]))
+    np.testing.assert_allclose(places, [0.0, -38 / 70, 0.1, -30 / 70], atol=1e-6)  # to the left of camera 00
+    with pytest.raises(schema.DataError, match="has no camera 'image_04' but image_00"):
+        sources.open_recording(drive, camera="image_04")
+
+
+def test_a_camera_that_was_not_unpacked_is_named(drive):
+    with pytest.raises(schema.DataError, match="no drive has frames of image_03; there are image_02"):
+        sources.open_recording(drive, camera="image_03")
+
+
+def test_several_drives_are_one_recording(drive, tmp_path):
+    second = drive.parent / "2011_09_26_drive_0100_sync"
+    shutil.copytree(drive, second)
+    recording = sources.open_recording(tmp_path)
+    assert [(s.split, s.name, s.length) for s in recording.sequences] == [
+        (split, name, length) for name in (drive.name, second.name) for split, length in (("train", 8), ("val", 4))]
+    without(second, "velodyne_points")
+    with pytest.warns(schema.DataWarning, match=r"0100_sync.*velodyne_points.* The drive is left out"):
+        recording = sources.open_recording(tmp_path)
+    assert {sequence.name for sequence in recording.sequences} == {drive.name}
+
+
 def break_file(name, content):
     def apply(drive):
         path = drive / name
@@ -125,13 +189,11 @@ GOOD, BAD = (5.0, 1.0, 0.0, 0.0), (float("nan"), 1.0, 0.0, 0.0)
 
 
 @pytest.mark.parametrize(("damage", "message"), [
-    (remove("image_02/timestamps.txt"), "timestamps.txt is missing.*time stamps of the images"),
+    (remove("image_02/timestamps.txt"), "timestamps.txt is missing.*time stamps of image_02"),
     (break_file("image_02/timestamps.txt", lambda c: b"\n".join(c.splitlines()[:7])), "line 8 .*only 7 lines"),
     (break_file("image_02/timestamps.txt", lambda c: c.replace(b"2011", b"soon", 1)), "line 1 .*not like 2011-09-26"),
     (break_file("image_02/timestamps.txt", swap_lines), "timestamps.txt, line 2: .*must increase"),
     (remove("oxts/data"), "0000000000.txt is missing .*the oxts frames"),
-    (remove("image_02/data"), "0000000000.png is missing .*the image_02 frames"),
-    (remove("velodyne_points/data"), "0000000000.bin is missing .*velodyne_points frames"),
     (remove("../calib_velo_to_cam.txt"), "calib_velo_to_cam.txt is missing.*calibration"),
     (break_file("../calib_cam_to_cam.txt", lambda c: c.replace(b"P_rect_02", b"P_rect_07")), "\"P_rect_02:\" with 12"),
 ])

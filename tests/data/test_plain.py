@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import recording_writers as writers
+from PIL import Image
 
 from muvo_jax.data import plain, schema, sources
 
@@ -146,3 +147,15 @@ def test_folders_that_are_no_recording(tmp_path):
         sources.open_recording(tmp_path)
     with pytest.raises(schema.DataError, match="is a file"):
         sources.open_recording(tmp_path / "holiday.jpg")
+
+
+def test_images_may_be_jpeg(tmp_path):
+    root = writers.write_plain(tmp_path / "rec")
+    for index, suffix in ((3, ".jpg"), (4, ".jpeg")):
+        path = root / f"train/a/image/{index:06d}.png"
+        Image.open(path).save(path.with_suffix(suffix), quality=95)
+        path.unlink()
+    recording = plain.PlainRecording(root)
+    assert recording.sequences[0].length == 10
+    for index in (2, 3, 4):
+        assert np.abs(recording.read(recording.sequences[0], index)["image"].astype(int) - index).max() <= 2

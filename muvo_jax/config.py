@@ -234,6 +234,7 @@ class DataConfig:
       context, horizon: evaluation observes `context` frames and imagines `horizon` more.
       town_seed, town_size: which town, and how much of it ("default", "tiny").
       cache_gib: decoded frames are kept in memory up to this size.
+      skip_corrupt_shards: leave damaged shards of a packed recording out, counted, instead of stopping.
     """
 
     path: str = "town"
@@ -245,6 +246,7 @@ class DataConfig:
     town_seed: int = 0
     town_size: str = "default"
     cache_gib: float = 1.5
+    skip_corrupt_shards: bool = False
 
     def __post_init__(self):
         for name in ("frames", "stride", "context", "horizon"):

@@ -7,6 +7,7 @@ here it is [*K, I, O] and [I, O] throughout.
 
 from __future__ import annotations
 
+import dataclasses
 import re
 from collections.abc import Callable, Mapping
 from typing import Any
@@ -15,7 +16,7 @@ import jax
 import numpy as np
 
 from muvo_jax.config import ModelConfig
-from muvo_jax.model import world_model
+from muvo_jax.model import tokens, world_model
 
 _QUERIES = {"image": "image", "range_view": "lidar", "occupancy": "voxel", "action": "policy"}
 _GATES = {"update": "z", "reset": "r", "new": "q"}
@@ -81,18 +82,23 @@ _RULES: tuple[tuple[str, str | Callable[[re.Match[str]], str]], ...] = (
     (r"^(rgb_decoder|lidar_re)/seed", r"\1/pre_transpose_conv/0"),
     (r"^(rgb_decoder|lidar_re)/up([012])/conv", lambda match: f"{match[1]}/pre_transpose_conv/{2 * int(match[2]) + 2}"),
     (r"^(rgb_decoder|lidar_re)/up([345])/conv", lambda match: f"{match[1]}/trans_conv{int(match[2]) - 2}/0"),
+    (r"^decoders_birds_eye/(head_\d)/(offset|center)", r"bev_decoder/\1/instance_\2_head/0"),
+    (r"^decoders_birds_eye/(head_\d)/segmentation", r"bev_decoder/\1/segmentation_head/0"),
+    (r"^decoders_birds_eye/", "bev_decoder/"),
     (r"^decoders_occupancy/(head_\d)", r"voxel_decoder/\1/segmentation_head/0"),
-    (r"^decoders_occupancy/constant", "voxel_decoder/constant_tensor"),
-    (r"^decoders_occupancy/block(\d)", r"voxel_decoder/middle_conv/\1"),
-    (r"^decoders_occupancy/up_(\d)", lambda match: f"voxel_decoder/conv{ {4: 1, 2: 2, 1: 3}[int(match[1])] }"),
+    (r"^(?:decoders_occupancy|(bev_decoder))/constant",
+     lambda match: f"{match[1] or 'voxel_decoder'}/constant_tensor"),
     (r"^decoders_occupancy/", "voxel_decoder/"),
-    (r"^(voxel_decoder/.*(?:first_conv|conv\d))/(?:conv|0)/", r"\1/conv_act/0/"),
-    (r"^(voxel_decoder/.*(?:first_conv|conv\d))/(?:norm|1)/style", r"\1/adaptive_norm/latent_affine"),
-    (r"^voxel_decoder/first_norm/style", "voxel_decoder/first_norm/latent_affine"),
-    (r"^(rgb_decoder|lidar_re|voxel_decoder)/first/", r"\1/pre_transpose_conv/0/"),
-    (r"^(rgb_decoder|lidar_re)/pre(\d)/conv", lambda match: f"{match[1]}/pre_transpose_conv/{int(match[2]) + 2}/0"),
+    (r"^(voxel|bev)_decoder/block(\d)", r"\1_decoder/middle_conv/\2"),
+    (r"^(voxel|bev)_decoder/up_(\d)", lambda match: f"{match[1]}_decoder/conv{ {4: 1, 2: 2, 1: 3}[int(match[2])] }"),
+    (r"^((?:voxel|bev)_decoder/.*(?:first_conv|conv\d))/(?:conv|0)/", r"\1/conv_act/0/"),
+    (r"^((?:voxel|bev)_decoder/.*(?:first_conv|conv\d))/(?:norm|1)/style", r"\1/adaptive_norm/latent_affine"),
+    (r"^(voxel|bev)_decoder/first_norm/style", r"\1_decoder/first_norm/latent_affine"),
+    (r"^(rgb_decoder|lidar_re|(?:voxel|bev)_decoder)/first/", r"\1/pre_transpose_conv/0/"),
+    (r"^(rgb_decoder|lidar_re|bev_decoder)/pre(\d)/conv",
+     lambda match: f"{match[1]}/pre_transpose_conv/{int(match[2]) + 2}/0"),
     (r"^voxel_decoder/pre(\d)/conv", lambda match: f"voxel_decoder/pre_transpose_conv/{2 * int(match[1]) + 2}"),
-    (r"^(rgb_decoder|lidar_re|voxel_decoder)/grow_(\d)/conv",
+    (r"^(rgb_decoder|lidar_re|(?:voxel|bev)_decoder)/grow_(\d)/conv",
      lambda match: f"{match[1]}/trans_conv{ {4: 1, 2: 2, 1: 3}[int(match[2])] }/0"),
     (r"encoder/stage(\d)_(\d)", r"encoder/stages_\1/\2"),
     (r"(encoder/stages_\d/\d)/widen/", r"\1/conv1_1x1/"),
@@ -110,8 +116,20 @@ _RULES: tuple[tuple[str, str | Callable[[re.Match[str]], str]], ...] = (
     (r"/var$", "/running_var"),
 )
 
-# In every checkpoint and used by nothing: BatchNorm's counters, and the layers that transformers were copied from.
-_UNUSED = re.compile(r"^encoder_layer\.|^rssm\.(prior|posterior)\.transformer_decoder_layer\.|\.num_batches_tracked$")
+# In every checkpoint and used by nothing.
+_UNUSED = {
+    r"\.num_batches_tracked$": "counter of torch's BatchNorm",
+    r"^encoder_layer\.|^rssm\.(prior|posterior)\.transformer_decoder_layer\.": "template that layers were copied from",
+    r"^frustum_pooling\.bev_intrinsics$": "computed from the configuration",
+}
+
+
+# Weights that are 1x1 convolutions there and dense layers here -> how many axes of size 1 they end in.
+_POINTWISE = {
+    r"^voxel_decoder\..*_head\.0\.weight$": 3,
+    r"_head\.0\.weight$": 2,
+    r"^rssm\.recurrent_model\.(w|conv_\w(_glo)?)\.weight$": 1,
+}
 
 
 def reference_key(path: str) -> str:
@@ -126,7 +144,7 @@ def to_our_layout(leaf: str, shape: tuple[int, ...], value: np.ndarray) -> np.nd
     if leaf == "type_embedding":
         return value[0, 0].T
     if leaf.startswith("query_"):  # (1, C, *grid), or (1, 1, C) for a single token
-        return value[0] if value.ndim == 3 else value[0].reshape(value.shape[1], -1).T
+        return value[0] if leaf == "query_action" else value[0].reshape(value.shape[1], -1).T
     if leaf == "constant":
         return np.moveaxis(value, 0, -1)
     if leaf in ("seed_kernel", "transposed_kernel"):
@@ -164,6 +182,52 @@ def reference_shape(path: str, shape: tuple[int, ...]) -> tuple[int, ...]:
     return to_reference_layout(path, np.broadcast_to(np.float32(0), shape)).shape
 
 
+@dataclasses.dataclass(frozen=True)
+class Match:
+    """How the keys of a checkpoint fit a model.
+
+    Attributes:
+      mapped: reference key -> path of our variable.
+      ignored: reference key -> why nothing reads it.
+      missing: keys that the model needs and the checkpoint lacks.
+      unexpected: keys that nothing asks for.
+      misshapen: what was found and wanted, a line for each key.
+    """
+
+    mapped: dict[str, str]
+    ignored: dict[str, str]
+    missing: list[str]
+    unexpected: list[str]
+    misshapen: list[str]
+
+    def problems(self) -> str:
+        """What does not fit, in one line; empty where all does."""
+        return "; ".join(f"{len(keys)} {what}: {_listed(keys)}" for what, keys in
+                         (("missing", self.missing), ("unexpected", self.unexpected),
+                          ("of another shape", self.misshapen)) if keys)
+
+
+def match_state_dict(state_dict: Mapping[str, np.ndarray], model_config: ModelConfig) -> Match:
+    """Compares names and shapes; arguments as `convert_state_dict`."""
+    wanted = {reference_key(path): (path, shape) for path, shape in _variables(model_config)}
+    mapped = {key: path for key, (path, _) in wanted.items() if key in state_dict}
+    others = [key for key in state_dict if key not in wanted]
+    ignored = {key: reason for key in others if (reason := unused_reason(key)) is not None}
+    misshapen = []
+    for key, path in mapped.items():
+        shape = wanted[key][1]
+        value = to_our_layout(path.rsplit("/")[-1], shape, np.asarray(state_dict[key]))
+        if value.shape != shape:
+            misshapen.append(f"{key} {list(state_dict[key].shape)} (becomes {list(value.shape)}, wanted {list(shape)})")
+    return Match(mapped, ignored, [key for key in wanted if key not in state_dict],
+                 [key for key in others if key not in ignored], misshapen)
+
+
+def unused_reason(key: str) -> str | None:
+    """Why no model reads this key of a checkpoint, None where one may."""
+    return next((reason for pattern, reason in _UNUSED.items() if re.search(pattern, key)), None)
+
+
 def convert_state_dict(state_dict: Mapping[str, np.ndarray], model_config: ModelConfig) -> dict[str, Any]:
     """Variables of WorldModel(model_config) with the reference's numbers.
 
@@ -177,26 +241,51 @@ def convert_state_dict(state_dict: Mapping[str, np.ndarray], model_config: Model
     Raises:
       ValueError: naming the keys that are missing, unexpected, or of another shape than the configuration says.
     """
-    shapes = world_model.WorldModel(model_config).variable_shapes()
-    leaves, structure = jax.tree_util.tree_flatten_with_path(shapes)
-    wanted = [("/".join(part.key for part in path[1:]), leaf.shape) for path, leaf in leaves]
-    keys = [reference_key(path) for path, _ in wanted]
-    missing = [key for key in keys if key not in state_dict]
-    unexpected = [key for key in state_dict if key not in set(keys) and not _UNUSED.search(key)]
-    values, misshapen = [], []
-    for key, (path, shape) in zip(keys, wanted, strict=True):
-        if key in missing:
-            continue
-        value = to_our_layout(path.rsplit("/")[-1], shape, np.asarray(state_dict[key]))
-        values.append(np.ascontiguousarray(value, np.float32))
-        if value.shape != shape:
-            misshapen.append(f"{key} {list(state_dict[key].shape)} (becomes {list(value.shape)}, wanted {list(shape)})")
-    problems = [f"{len(names)} {what}: {_listed(names)}" for what, names in
-                (("missing", missing), ("unexpected", unexpected), ("of another shape", misshapen)) if names]
-    if problems:
+    match = match_state_dict(state_dict, model_config)
+    if problems := match.problems():
         raise ValueError(f"The checkpoint does not fit the {model_config.variant} model ({model_config.latent}); "
-                         f"keys {'; '.join(problems)}. Check the heads and sizes of the model's configuration.")
-    return jax.tree_util.tree_unflatten(structure, values)
+                         f"keys {problems}. Check the heads and sizes of the model's configuration.")
+
+    def value(path, leaf):
+        path = _joined(path)
+        stored = np.asarray(state_dict[reference_key(path)])
+        return np.ascontiguousarray(to_our_layout(path.rsplit("/")[-1], leaf.shape, stored), np.float32)
+
+    return jax.tree_util.tree_map_with_path(value, world_model.WorldModel(model_config).variable_shapes())
+
+
+def reference_state_dict(variables: Mapping[str, Any], model_config: ModelConfig) -> dict[str, np.ndarray]:
+    """The inverse of `convert_state_dict`: reference key -> float32 array of the reference's shape.
+
+    Keys that a checkpoint holds and no model reads are not made.
+    """
+    out = {}
+    for path, leaf in jax.tree_util.tree_flatten_with_path(dict(variables))[0]:
+        ours = _joined(path)
+        key, value = reference_key(ours), to_reference_layout(ours, np.asarray(leaf, np.float32))
+        out[key] = np.ascontiguousarray(value.reshape(_full_shape(key, ours, value.shape, model_config)))
+    return out
+
+
+def _variables(model_config: ModelConfig) -> list[tuple[str, tuple[int, ...]]]:
+    """Path and shape of every variable."""
+    shapes = world_model.WorldModel(model_config).variable_shapes()
+    return [(_joined(path), leaf.shape) for path, leaf in jax.tree_util.tree_flatten_with_path(shapes)[0]]
+
+
+def _joined(path: tuple) -> str:
+    """"camera/backbone/conv1/kernel" without the collection in front."""
+    return "/".join(part.key for part in path[1:])
+
+
+def _full_shape(key: str, path: str, shape: tuple[int, ...], model_config: ModelConfig) -> tuple[int, ...]:
+    """With the axes of size 1 that the reference's 1x1 convolutions have, and the grids of its queries."""
+    group = path.rsplit("query_")[-1] if "/query_" in path else None
+    if group is not None:
+        grid = tokens.groups(model_config)[group]
+        return (*shape[:2], *grid) if grid else shape
+    axes = next((axes for pattern, axes in _POINTWISE.items() if re.search(pattern, key)), 0)
+    return shape + (1,) * axes
 
 
 def _listed(names: list[str], most: int = 8) -> str:

@@ -61,7 +61,7 @@ class Pack:
           ValueError: where the shapes differ.
         """
         got = np.asarray(got)
-        want, have, extra = self._compared(name, got)
+        want, have, extra = self._compare(name, got)
         if want.size == 0:
             return extra
         want, have = want.astype(np.float64), have.astype(np.float64)
@@ -75,13 +75,17 @@ class Pack:
         Raises:
           ValueError: where the shapes differ.
         """
-        want, have, _ = self._compared(name, np.asarray(got))
+        want, have, _ = self._compare(name, np.asarray(got))
         different = want != have
         if ignore is not None:
             different = different[~ignore.reshape(different.shape)]
         return float(different.mean()) if different.size else 0.0
 
-    def _compared(self, name: str, got: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
+    def stored(self, name: str, got: Any) -> tuple[np.ndarray, np.ndarray]:
+        """The stored values of an entry, and the same ones of `got`, which has the shape of the whole entry."""
+        return self._compare(name, np.asarray(got))[:2]
+
+    def _compare(self, name: str, got: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
         """Stored values, the same of `got`, and the error of the statistics of a sub-sampled entry."""
         if got.shape != self.shape(name):
             raise ValueError(f"{name}: got shape {list(got.shape)}, expected {list(self.shape(name))}.")

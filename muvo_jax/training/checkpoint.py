@@ -116,10 +116,7 @@ class Checkpoints:
         Raises:
           CheckpointError: where writing failed (disk full); earlier checkpoints stay untouched.
         """
-        meta = {"schema_version": SCHEMA_VERSION, "step": step, "variant": config.model.variant,
-                "config": config.to_dict(), "contract": dataclasses.asdict(config.contract),
-                "packages": package_versions(), "provenance": dict(provenance or {}),
-                "data_state": _encode(data_state), "score": score}
+        meta = _meta(step, config, provenance, data_state, score)
         items = ocp.args.Composite(
             variables=ocp.args.StandardSave({"params": state.params, "batch_stats": state.batch_stats}),
             training=ocp.args.StandardSave({"opt_state": state.opt_state, "key": state.key, "step": state.step}),
@@ -195,6 +192,31 @@ class Checkpoints:
         self._manager.close()
 
 
+def save_variables(run_folder: str | os.PathLike, step: int, variables: types.Variables, *, config: config_lib.Config,
+                   provenance: Mapping[str, Any] | None = None) -> pathlib.Path:
+    """Writes a checkpoint for inference and for `train --init`, without the state of an optimiser.
+
+    Args:
+      run_folder: RUN; the checkpoint becomes RUN/checkpoints/STEP.
+      step: updates that made the variables.
+      variables: {"params", "batch_stats"}; NumPy arrays may be memory-mapped.
+      config: of the model.
+      provenance: where the variables come from.
+
+    Raises:
+      OSError: where it cannot be written.
+    """
+    _quiet()
+    folder = pathlib.Path(run_folder).resolve() / FOLDER / str(step)
+    folder.mkdir(parents=True)
+    with ocp.StandardCheckpointer() as writer:
+        writer.save(folder / "variables", {"params": variables["params"], "batch_stats": variables["batch_stats"]})
+    with ocp.Checkpointer(ocp.JsonCheckpointHandler()) as writer:
+        writer.save(folder / "meta", _meta(step, config, provenance))
+    integrity.seal(folder)
+    return folder
+
+
 def load_run(run: str | os.PathLike, which: int | str = "latest") -> LoadedRun:
     """Loads a trained model for inference onto the first device, wherever it was trained.
 
@@ -257,6 +279,14 @@ def read_meta(folder: pathlib.Path) -> dict[str, Any]:
         raise ValueError(f"{folder} has checkpoint schema {meta['schema_version']}, this version reads "
                          f"{SCHEMA_VERSION}. It was written by muvo_jax {meta['packages'].get('muvo_jax')}: use that.")
     return meta
+
+
+def _meta(step: int, config: config_lib.Config, provenance: Mapping[str, Any] | None, data_state=None,
+          score: float | None = None) -> dict[str, Any]:
+    return {"schema_version": SCHEMA_VERSION, "step": step, "variant": config.model.variant,
+            "config": config.to_dict(), "contract": dataclasses.asdict(config.contract),
+            "packages": package_versions(), "provenance": dict(provenance or {}),
+            "data_state": _encode(data_state), "score": score}
 
 
 def package_versions() -> dict[str, str | None]:

@@ -70,7 +70,7 @@ def pack(tree) -> dict[str, types.Array]:
     """
     groups: dict[str, list[types.Array]] = {"decayed": [], "undecayed": []}
     for leaf in jax.tree.leaves(tree):
-        groups[_group(leaf)].append(leaf.reshape(-1))
+        groups[group_of(leaf.ndim)].append(leaf.reshape(-1))
     return {name: jnp.concatenate([jnp.zeros(0, jnp.float32), *leaves]) for name, leaves in groups.items()}
 
 
@@ -80,14 +80,15 @@ def unpack(packed: dict[str, types.Array], like):
     taken = dict.fromkeys(packed, 0)
     out = []
     for leaf in leaves:
-        name = _group(leaf)
+        name = group_of(leaf.ndim)
         out.append(packed[name][taken[name]:taken[name] + leaf.size].reshape(leaf.shape))
         taken[name] += leaf.size
     return jax.tree.unflatten(structure, out)
 
 
-def _group(leaf: types.Array) -> str:
-    return "undecayed" if leaf.ndim == 1 else "decayed"
+def group_of(axes: int) -> str:
+    """AdamW's group of a parameter with so many axes."""
+    return "undecayed" if axes == 1 else "decayed"
 
 
 def make_optimizer(config: config_lib.OptimizerConfig, total_steps: int) -> optax.GradientTransformation:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable
 from typing import Any
 
@@ -26,37 +25,39 @@ def channels_first(array: Any, axis: int = 1) -> np.ndarray:
     return np.moveaxis(np.asarray(array), -1, axis)
 
 
-def draw_variables(shapes: Any, prefix: str = "", where: str = "", rename: tuple[str, str] | None = None) -> Any:
+def draw_variables(shapes: Any, prefix: str = "", where: str = "",
+                   rename: Callable[[str], str] | None = None) -> Any:
     """Variables of the given shapes, drawn by the rule.
 
     Args:
       shapes: {"params": ..., ...} as jax.eval_shape gives.
       prefix: of the reference's keys, such as "encoder.".
       where: place of the module in our network, such as "camera/neck/", which the names are translated from.
-      rename: (pattern, replacement) applied to each of the reference's keys.
+      rename: applied to each of the reference's keys.
     """
     def draw(path, leaf):
         ours = where + "/".join(part.key for part in path[1:])
         key = prefix + names.reference_key(ours)
         if rename is not None:
-            key = re.sub(*rename, key)
+            key = rename(key)
         drawn = weights_rule.make_param(key, names.reference_shape(ours, leaf.shape))
         return np.ascontiguousarray(names.to_our_layout(ours.rsplit("/")[-1], leaf.shape, drawn), np.float32)
 
     return jax.tree_util.tree_map_with_path(draw, shapes)
 
 
-def run(module, *args, prefix: str = "", where: str = "", static: tuple = ()) -> Any:
+def run(module, *args, prefix: str = "", where: str = "", rename: Callable[[str], str] | None = None,
+        static: tuple = ()) -> Any:
     """Applies a module with drawn weights, jitted: module(*args, *static).
 
     Args:
       args: arrays.
-      prefix, where: see `draw_variables`.
+      prefix, where, rename: see `draw_variables`.
       static: further arguments that are no arrays.
     """
     args = tuple(jnp.asarray(arg) if isinstance(arg, np.ndarray) else arg for arg in args)
     shapes = jax.eval_shape(lambda key, *inputs: module.init(key, *inputs, *static), jax.random.key(0), *args)
-    variables = draw_variables(shapes, prefix, where)
+    variables = draw_variables(shapes, prefix, where, rename)
     return jax.jit(lambda variables, *inputs: module.apply(variables, *inputs, *static))(variables, *args)
 
 

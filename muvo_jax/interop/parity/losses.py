@@ -14,8 +14,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from muvo_jax import types
-from muvo_jax.interop.parity import cases
+from muvo_jax.interop import reference_losses
+from muvo_jax.interop.parity import cases, drawing
 from muvo_jax.metrics import image as image_metrics
+from muvo_jax.metrics import points
+from muvo_jax.model import camera
+from muvo_jax.nn import resnet
 from muvo_jax.objectives import kl, regression, scal
 from muvo_jax.ops import nearest
 
@@ -106,15 +110,18 @@ def scene_class_affinity(context: cases.Context) -> Checks:
 
 
 def chamfer(context: cases.Context) -> Checks:
-    points = context.settings.size("p1", "chamfer_points")
-    squashed = np.array([30.0, 30.0, 6.0], np.float32)
-    prediction, target = (context.draw(f"cd_{side}", (2, 2, points, 3), "pm1") * squashed for side in ("pred", "tgt"))
-
     def value(prediction, target):
-        flat = lambda clouds: clouds.reshape(-1, points, 3)
+        flat = lambda clouds: clouds.reshape(-1, *clouds.shape[2:])
         return 2.0 * jax.vmap(nearest.chamfer)(flat(prediction), flat(target)).mean()
 
-    yield from _loss("cd_loss", value, prediction, target)
+    yield from _loss("cd_loss", value, *_clouds(context))
+
+
+def _clouds(context: cases.Context) -> tuple[np.ndarray, np.ndarray]:
+    shape = (2, 2, context.settings.size("p1", "chamfer_points"), 3)
+    squashed = np.array([30.0, 30.0, 6.0], np.float32)
+    prediction, target = (context.draw(f"cd_{side}", shape, "pm1") * squashed for side in ("pred", "tgt"))
+    return prediction, target
 
 
 def peak_signal_to_noise(context: cases.Context) -> Checks:
@@ -126,11 +133,136 @@ def peak_signal_to_noise(context: cases.Context) -> Checks:
     yield cases.Check("metric_psnr_2batches", (first.mean() + second.mean()) / 2, LOSS_TOLERANCE)
 
 
+VOXEL_WEIGHTS = (1.0, 1.0, 1.0, 1.5, 2.0, 3.0, 1.0, 1.0, 1.0)
+SEGMENTATION_WEIGHTS = (1.0, 1.0, 1.0, 2.0, 3.0, 1.0, 1.0, 1.0)
+PERCEPTUAL_TOLERANCES = (1e-4, 1e-3)
+
+
+def flat_frames(logits: jax.Array, target: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """[B, S, C, *grid] and [B, S, 1, *grid] -> [B S, P, C] and [B S, P]"""
+    flat = _last(logits).reshape(logits.shape[0] * logits.shape[1], -1, logits.shape[2])
+    return flat, target.reshape(flat.shape[:2])
+
+
+def voxel_classes(context: cases.Context) -> Checks:
+    """Cross-entropy, affinity and Dice terms of two and nine classes."""
+    batch, frames, *grid = context.settings.size("p1", "voxel_bsxyz")
+    for classes in (2, 9):
+        logits = 3 * context.draw(f"vox_pred{classes}", (batch, frames, classes, *grid), "pm1")
+        draw = lambda suffix, classes=classes: context.draw(f"vox_tgt{classes}", (batch, frames, 1, *grid),
+                                                            f"voxel{classes}{suffix}")
+        target = draw("")
+        options: dict[str, dict[str, Any]] = {"plain": {}, "topk0.5": {"top_share": 0.5}, "poly1": {"poly": 2.0}}
+        if classes == 9:
+            options["weighted"] = {"weights": VOXEL_WEIGHTS}
+            options["weighted_topk0.5"] = {"weights": VOXEL_WEIGHTS, "top_share": 0.5}
+        for tag, option in options.items():
+            loss = lambda *args, option=option: reference_losses.cross_entropy(*flat_frames(*args), **option)
+            yield from _loss(f"voxel_ce_c{classes}_{tag}", loss, logits, target)
+        for epsilon, naive in ((1, True), (0.001, True), (0.001, False)):
+            loss = lambda *args, epsilon=epsilon, naive=naive: reference_losses.dice(
+                *flat_frames(*args), epsilon=epsilon, naive=naive)
+            yield from _loss(f"dice_c{classes}_eps{epsilon}_naive{int(naive)}", loss, logits, target)
+        if classes == 9:  # two classes are the library's own terms, see scene_class_affinity
+            for suffix in ("", "_ign"):
+                for term, function in (("sem_scal", reference_losses.semantic_scal),
+                                       ("geo_scal", reference_losses.geometric_scal)):
+                    loss = lambda *args, function=function: function(*flat_frames(*args))
+                    yield from _loss(f"{term}_c9{suffix}", loss, logits, draw(suffix))
+
+
+def segmentation(context: cases.Context) -> Checks:
+    size = context.settings.size("p1", "segmentation_hw")
+    for name, prefix, classes, option in (
+            ("seg_plain", "seg", 8, {}), ("seg_weights", "seg", 8, {"weights": SEGMENTATION_WEIGHTS}),
+            ("seg_topk0.25_weights", "seg", 8, {"weights": SEGMENTATION_WEIGHTS, "top_share": 0.25}),
+            ("seg_poly1", "seg", 8, {"poly": 1.0}),
+            ("seg9_topk0.5_voxelweights", "seg9", 9, {"weights": VOXEL_WEIGHTS, "top_share": 0.5})):
+        logits = 3 * context.draw(f"{prefix}_pred", (2, 2, classes, *size), "pm1")
+        target = context.draw(f"{prefix}_tgt", (2, 2, 1, *size), f"labels{classes}")
+        options: dict[str, Any] = dict(option)
+        loss = lambda *args, options=options: reference_losses.cross_entropy(*flat_frames(*args), **options)
+        yield from _loss(name, loss, logits, target)
+
+
+def structural_similarity(context: cases.Context) -> Checks:
+    prediction, target = _pictures(context)
+
+    def similarity(prediction, target, non_negative=False):
+        flat = lambda image: _last(image).reshape(-1, *image.shape[3:], 3)
+        return reference_losses.ssim(flat(prediction), flat(target), non_negative=non_negative)
+
+    yield from _loss("ssim", similarity, prediction, target)
+    yield from _loss("ssim_nonneg", lambda prediction, target: similarity(prediction, target, True), prediction, target)
+    window = np.broadcast_to(reference_losses.ssim_window(), (3, 1, 11, 11))
+    yield cases.Check("ssim_window", window, LOSS_TOLERANCE)
+    both = (similarity(prediction, target) + similarity(np.float32(0.9) * target, target)) / 2
+    yield cases.Check("metric_ssim_2batches", both, LOSS_TOLERANCE)
+
+
+def chamfer_metrics(context: cases.Context) -> Checks:
+    """Half of both mean distances; of all points, and of those near the vehicle."""
+    prediction, target = (cloud.reshape(-1, *cloud.shape[2:]) for cloud in _clouds(context))
+    batches = ((prediction, target), (target + np.float32(0.1), target))
+    near = lambda cloud: cloud[((cloud >= (-20, -20, -2)) & (cloud <= (20, 20, 6))).all(axis=-1)]
+    mean = lambda inner: np.mean([[points.chamfer_m(*(near(cloud) if inner else cloud for cloud in pair))
+                                   for pair in zip(*clouds, strict=True)] for clouds in batches])
+    yield cases.Check("metric_cd_1d_2batches", mean(False), LOSS_TOLERANCE)
+    yield cases.Check("metric_cd_2d_2batches_full_inner", np.array([mean(False), mean(True)]), LOSS_TOLERANCE)
+
+
+def class_scores(context: cases.Context) -> Checks:
+    shape = context.settings.size("p1", "ssc")
+    for classes in (2, 9):
+        truth = context.draw(f"ssc_true{classes}", shape, f"voxel{classes}_ign")
+        keep = (context.draw(f"ssc_mix{classes}", shape, "uniform") < 0.7) & (truth != IGNORED)
+        prediction = np.where(keep, truth, context.draw(f"ssc_pred{classes}", shape, f"voxel{classes}"))
+        nonempty = context.draw(f"ssc_ne{classes}", shape, "uniform") < 0.5
+        first = reference_losses.class_counts(prediction, truth, classes)
+        second = reference_losses.class_counts(prediction, np.where(truth == IGNORED, 0, truth), classes)
+        for tag, counts in (("batch1", first), ("batch2", first + second),
+                            ("nonempty", reference_losses.class_counts(prediction, truth, classes, nonempty))):
+            overall, each = reference_losses.class_scores(counts)
+            yield cases.Check(f"ssc_c{classes}_{tag}", overall, LOSS_TOLERANCE)
+            yield cases.Check(f"ssc_c{classes}_{tag}_perclass", each, LOSS_TOLERANCE)
+
+
+def perceptual(context: cases.Context) -> Checks:
+    """Distances of a ResNet-18's maps of the normalised pictures."""
+    size = context.settings.size("p1", "perceptual_hw")
+    prediction, target = (context.draw(f"perc_{side}", (1, 2, 3, *size), "smooth") for side in ("pred", "tgt"))
+    network, weights = perceptual_network((2, *size, 3))
+    maps = lambda picture: perceptual_maps(network, weights, picture)
+    for level, value in enumerate(jax.jit(maps)(prediction)):
+        yield cases.Check(f"perceptual_feat{level}", drawing.channels_first(value), PERCEPTUAL_TOLERANCES[0])
+    for name, norm, style in (("l2", "l2", False), ("l1", "l1", False), ("l2_style", "l2", True)):
+        loss = lambda *pictures, norm=norm, style=style: reference_losses.feature_distance(
+            *(maps(picture) for picture in pictures), norm=norm, style=style)
+        yield from _loss(f"perceptual_{name}", loss, prediction, target, tolerances=PERCEPTUAL_TOLERANCES)
+
+
+def perceptual_network(shape: tuple[int, ...]) -> tuple[resnet.ResNet18, Any]:
+    """The frozen network of the perceptual loss and its drawn weights, for pictures [N, H, W, 3] of `shape`."""
+    network = resnet.ResNet18(64, (1, 2, 3, 4))
+    shapes = jax.eval_shape(lambda picture: network.init(jax.random.key(0), picture, drawing.EVAL),
+                            jax.ShapeDtypeStruct(shape, jnp.float32))
+    return network, drawing.draw_variables(shapes, "perceptual_loss.model.")
+
+
+def perceptual_maps(network: resnet.ResNet18, weights: Any, picture: jax.Array) -> Any:
+    """Maps of pictures [B, S, 3, H, W] in [0, 1]."""
+    flat = _last(picture).reshape(-1, *picture.shape[3:], 3)
+    mean, std = (jnp.asarray(value, jnp.float32).reshape(1, 1, 1, 3)
+                 for value in (camera.IMAGENET_MEAN, camera.IMAGENET_STD))
+    return network.apply(weights, (flat - mean) / std, drawing.EVAL)
+
+
 def _pictures(context: cases.Context) -> tuple[np.ndarray, np.ndarray]:
     size = context.settings.size("p1", "ssim_hw")
     target, noise = (context.draw(name, (2, 2, 3, *size), "smooth") for name in ("rgb_tgt", "rgb_pred"))
     return np.float32(0.7) * target + np.float32(0.3) * noise, target
 
 
-GROUPS: tuple[cases.Group, ...] = (divergence, regressions, spatial, scene_class_affinity, chamfer,
-                                   peak_signal_to_noise)
+GROUPS: tuple[cases.Group, ...] = (
+    divergence, regressions, spatial, scene_class_affinity, voxel_classes, segmentation, structural_similarity,
+    peak_signal_to_noise, chamfer, chamfer_metrics, class_scores, perceptual)

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -85,7 +86,8 @@ def decoded(context: cases.Context) -> Checks:
     plane = lambda size, channels: decoders.PlaneDecoder(size, channels, CONFIG.decoder_channels)
     yield cases.Check("policy/out", drawing.run(decoders.ActionDecoder(), state, where="decoders_action/")[1],
                       TOLERANCE)
-    voxels = decoders.VoxelDecoder(CONFIG.voxels.shape, 2, CONFIG.occupancy_channels, CONFIG.occupancy_blocks)
+    voxels = decoders.StyledDecoder(CONFIG.voxels.shape, 2, 2 * CONFIG.occupancy_channels, CONFIG.occupancy_channels,
+                                    CONFIG.occupancy_blocks)
     for module, rows, where, name, tolerance in (
             (plane(CONFIG.image_size, 3), state[:1], "decoders_image/", "rgb_decoder/rgb", TOLERANCE),
             (plane((64, 1024), 4), state, "decoders_range_view/", "lidar_re/lidar_reconstruction", TOLERANCE),
@@ -96,26 +98,28 @@ def decoded(context: cases.Context) -> Checks:
 
 def recurrent(context: cases.Context) -> Checks:
     sizes = [context.settings.size("p3_1d", "rssm", name) for name in ("batch", "steps", "imagine")]
-    yield from transition_checks(context, CONFIG, "rssm", *sizes,
-                                 embedding=context.draw("rssm_emb", (sizes[0], sizes[1], 512), "normal"),
-                                 prefix="", moved=lambda value: value)
+    yield from transition_checks(context, CONFIG, "rssm", "rssm", *sizes,
+                                 embedding=context.draw("rssm_emb", (*sizes[:2], CONFIG.embedding_channels), "normal"))
 
 
-def transition_checks(context: cases.Context, config: config_lib.ModelConfig, name: str, batch: int, steps: int,
-                      imagined: int, *, embedding: np.ndarray, prefix: str, moved) -> Checks:
+def transition_checks(context: cases.Context, config: config_lib.ModelConfig, name: str, label: str, batch: int,
+                      steps: int, imagined: int, *, embedding: np.ndarray,
+                      rename: Callable[[str], str] | None = None,
+                      moved: Callable[[Any], Any] = np.asarray) -> Checks:
     """Observes `steps` embeddings and imagines on, with the means and with drawn noise.
 
     Args:
       context, config: of the check and of the transition.
-      name: of the inputs; the entries are called {name}_sample{0, 1}.
+      name: of the inputs.
+      label: the entries are called {label}_sample{0, 1}/...
       batch, steps, imagined: sizes.
       embedding: [batch, steps, ...].
-      prefix: replaces "rssm." of the reference's keys, where not empty.
+      rename: applied to the reference's keys.
       moved: brings a latent [B, T, ...] into the layout of the pack.
     """
     model = world_model.WorldModel(config)
     shapes = model.variable_shapes()["params"]["transition"]
-    drawn = drawing.draw_variables({"params": {"transition": shapes}}, rename=(r"^rssm\.", prefix or "rssm."))
+    drawn = drawing.draw_variables({"params": {"transition": shapes}}, rename=rename)
     variables = jax.tree.map(jnp.asarray, {**drawn, "batch_stats": {}})
     shape = model.initial_state(batch).stochastic.shape
     actions = context.draw(f"{name}_act", (batch, steps + imagined, 2), "pm1")
@@ -129,7 +133,7 @@ def transition_checks(context: cases.Context, config: config_lib.ModelConfig, na
         return np.swapaxes(context.draw(f"{name}_noise_{index}", tokens_first, "normal"), 0, 1)
 
     for sampled in (False, True):
-        label = f"{name}_sample{int(sampled)}"
+        entries = f"{label}_sample{int(sampled)}"
         noises = [drawn_noise(index) if sampled else np.zeros(shape, np.float32)
                   for index in range(2 * steps + imagined)]
         noise = StepNoise(jnp.asarray(np.stack(noises[0:2 * steps:2], 1)),
@@ -140,13 +144,13 @@ def transition_checks(context: cases.Context, config: config_lib.ModelConfig, na
                                      ("posterior", observed.posterior, noise.posterior)):
             for entry, value in (("hidden_state", observed.states.deterministic), ("mu", gaussian.mean),
                                  ("sigma", gaussian.std), ("sample", gaussian.sample(used))):
-                yield cases.Check(f"{label}/{kind}/{entry}", moved(value), TOLERANCE)
+                yield cases.Check(f"{entries}/{kind}/{entry}", moved(value), TOLERANCE)
         state, dreamt = observed.last, []
         for step in range(imagined):
             state, prior = imagine_step(variables, noises[2 * steps + step], actions[:, steps + step], state)
             dreamt.append((state.deterministic, state.stochastic, prior.mean, prior.std))
         for entry, *values in zip(("hidden_state", "sample", "mu", "sigma"), *dreamt, strict=True):
-            yield cases.Check(f"{label}/imagine/{entry}", moved(np.stack(values, 1)), TOLERANCE)
+            yield cases.Check(f"{entries}/imagine/{entry}", moved(np.stack(values, 1)), TOLERANCE)
 
 
 GROUPS: tuple[cases.Group, ...] = (backbones, necks, transformer, compression, measurements, decoded, recurrent)

@@ -1,0 +1,178 @@
+"""The authors' checkpoints: what is in the file, which model it is, and how its keys fit.
+
+A Lightning checkpoint keeps the network under "model." in its "state_dict"; preprocessing constants and, on the 2D code
+line, the network of the perceptual loss lie beside it.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+import pathlib
+import re
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import numpy as np
+
+from muvo_jax import config as config_lib
+from muvo_jax.interop import safetensors_file, torch_file
+
+_PREFIX = "model."
+_BESIDE = {
+    r"^preprocess\.": "constants of the preprocessing",
+    r"^perceptual_loss\.": "network of the perceptual loss",
+    r"^(train|val|test|metric)\w*\.": "state of a metric",
+}
+# (latent, heads with occupancy, backbone) -> the released file and its configuration.
+_PUBLISHED = {
+    ("1d", True, "resnet18"): "RV_WOB_TR_1d_Voxel (test_base_1d.yml)",
+    ("1d", False, "resnet18"): "RV_WOB_TR_1d_no_Voxel (test_base_1d_without_voxel.yml)",
+    ("2d", True, "resnet18"): "basic_voxel (test_base_2d.yml)",
+    ("2d", True, "mobilevitv2_100"): "mobilevit (test_mobilevit_2d.yml)",
+}
+
+
+class CheckpointMismatch(ValueError):
+    """The file is readable but holds no model of this family, or one that does not fit; the message says which keys."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Stored:
+    """A checkpoint's network.
+
+    Attributes:
+      path: of the file.
+      state_dict: reference key (without "model.") -> array, torch layout.
+      beside: keys of other things in the state_dict -> what they are.
+      facts: what the file says of its training, such as global_step.
+    """
+
+    path: pathlib.Path
+    state_dict: Mapping[str, np.ndarray]
+    beside: Mapping[str, str]
+    facts: Mapping[str, Any]
+
+
+def read(path: str | os.PathLike) -> Stored:
+    """Reads a Lightning checkpoint, or a bare state_dict (.pth, .pt, .safetensors), without torch.
+
+    Raises:
+      TorchFileError, SafetensorsError: for a file that cannot be read.
+      CheckpointMismatch: where it holds no tensors by name.
+    """
+    path = pathlib.Path(path)
+    loaded = safetensors_file.load(path) if path.suffix == ".safetensors" else torch_file.load(path)
+    outer = loaded if isinstance(loaded, dict) else {}
+    tensors = outer.get("state_dict", outer)
+    if not isinstance(tensors, dict) or not any(isinstance(value, np.ndarray) for value in tensors.values()):
+        held = f"a dict of {', '.join(map(str, list(outer)[:5]))}" if outer else f"a {type(loaded).__name__}"
+        raise CheckpointMismatch(f"{path}: expected a checkpoint with tensors by name (a state_dict), found {held}.")
+    tensors = {str(key): value for key, value in tensors.items() if isinstance(value, np.ndarray)}
+    beside = {key: reason for key in tensors
+              if (reason := next((why for pattern, why in _BESIDE.items() if re.search(pattern, key)), None))}
+    inner = {key.removeprefix(_PREFIX): value for key, value in tensors.items() if key not in beside}
+    facts = {name: outer[name] for name in ("epoch", "global_step", "pytorch-lightning_version")
+             if isinstance(outer.get(name), (int, str))}
+    return Stored(path, inner, beside, facts)
+
+
+def recognise(stored: Stored) -> config_lib.ModelConfig:
+    """The architecture that the keys and shapes of a checkpoint describe, with numerics="reference".
+
+    Raises:
+      CheckpointMismatch: where they describe no model of this family.
+    """
+    state_dict = stored.state_dict
+    landmarks = ("rssm.pre_gru_net.0.weight", "encoder.", "policy.fc.0.weight")
+    absent = [name for name in landmarks if not any(key.startswith(name) for key in state_dict)]
+    if absent:
+        raise CheckpointMismatch(
+            f"{stored.path}: expected a MUVO or MILE-style world model, whose keys include {', '.join(absent)}; found "
+            f"{len(state_dict)} keys such as {', '.join(list(state_dict)[:4])}.")
+    try:
+        return _describe(state_dict)
+    except (KeyError, IndexError) as error:
+        raise CheckpointMismatch(f"{stored.path}: expected a MUVO or MILE-style world model, but the key "
+                                 f"{error.args[0]!r} that tells its size is missing or has too few axes.") from error
+    except ValueError as error:
+        raise CheckpointMismatch(f"{stored.path}: its shapes describe a model that cannot be built: {error}") from error
+
+
+def published_name(model: config_lib.ModelConfig) -> str | None:
+    """The released file that a model of exactly this architecture is, None for others."""
+    released = dataclasses.replace(config_lib.ModelConfig(), numerics="reference", latent=model.latent,
+                                   heads=model.heads, backbone=model.backbone)
+    return _PUBLISHED.get((model.latent, "occupancy" in model.heads, model.backbone)) if model == released else None
+
+
+def _describe(state_dict: Mapping[str, np.ndarray]) -> config_lib.ModelConfig:
+    shape = lambda key: tuple(state_dict[key].shape)
+    has = lambda prefix: any(key.startswith(prefix) for key in state_dict)
+    fields: dict[str, Any] = {"numerics": "reference", "latent": "2d" if has("rssm.prior.query_embed_image") else "1d"}
+    fields["heads"] = tuple(head for head, prefix in (
+        ("image", "rgb_decoder."), ("range_view", "lidar_re."), ("occupancy", "voxel_decoder."), ("action", "policy."))
+        if has(prefix))
+    fields["route"], fields["speed"] = has("backbone_route."), has("speed_enc.")
+    fields["backbone_width"] = shape("encoder.conv1.weight")[0]
+    fields["token_channels"] = shape("type_embedding")[2]
+    fields["transformer_hidden_channels"] = shape("transformer_encoder.layers.0.linear1.weight")[0]
+    fields["transformer_layers"] = _count(state_dict, r"^transformer_encoder\.layers\.(\d+)\.")
+    if fields["speed"]:
+        fields["measurement_channels"] = shape("speed_enc.0.weight")[0]
+    fields |= (_token_latent if fields["latent"] == "2d" else _vector_latent)(state_dict, shape, fields["heads"])
+    return config_lib.ModelConfig(**fields)
+
+
+def _vector_latent(state_dict: Mapping[str, np.ndarray], shape: Callable[[str], tuple[int, ...]],
+                   heads: tuple[str, ...]) -> dict[str, Any]:
+    fields: dict[str, Any] = {
+        "deterministic_channels": shape("rssm.pre_gru_net.0.weight")[0],
+        "stochastic_channels": shape("rssm.pre_gru_net.0.weight")[1],
+        "action_channels": shape("rssm.prior_action_module.0.weight")[0],
+        "embedding_channels": shape("features_combine.weight")[0],
+        "fused_channels": shape("image_feature_conv.0.conv1.weight")[0]}
+    for head, name in (("image", "rgb_decoder"), ("range_view", "lidar_re")):
+        if head in heads:
+            fields["decoder_channels"] = shape(f"{name}.linear.0.weight")[0]
+    if "image" in heads:
+        rows, columns = shape("rgb_decoder.pre_transpose_conv.0.weight")[2:]
+        fields["image_size"] = (64 * rows, 64 * columns)
+    if "range_view" in heads:
+        rows, columns = shape("lidar_re.pre_transpose_conv.0.weight")[2:]
+        fields["range_view"] = config_lib.RangeViewGeometry(rows=64 * rows, columns=64 * columns)
+    if "occupancy" in heads:
+        blocks = _count(state_dict, r"^voxel_decoder\.middle_conv\.(\d+)\.")
+        fields["occupancy_blocks"] = blocks
+        fields["occupancy_channels"] = shape("voxel_decoder.constant_tensor")[0] // 2
+        fields["voxels"] = config_lib.VoxelGrid(
+            tuple(side * 2 ** (blocks + 3) for side in shape("voxel_decoder.constant_tensor")[1:]))
+    return fields
+
+
+def _token_latent(state_dict: Mapping[str, np.ndarray], shape: Callable[[str], tuple[int, ...]],
+                  heads: tuple[str, ...]) -> dict[str, Any]:
+    rows, columns = shape("rssm.prior.query_embed_lidar")[2:]
+    fields: dict[str, Any] = {
+        "image_size": tuple(32 * side for side in shape("rssm.prior.query_embed_image")[2:]),
+        "range_view": config_lib.RangeViewGeometry(rows=16 * rows, columns=16 * columns),
+        "transition_layers": _count(state_dict, r"^rssm\.prior\.module\.layers\.(\d+)\.")}
+    for head, name in (("image", "rgb_decoder"), ("range_view", "lidar_re")):
+        if head in heads:
+            fields["decoder_channels"] = shape(f"{name}.pre_transpose_conv.0.weight")[0]
+    stages = 1
+    if "occupancy" in heads:
+        stages = _count(state_dict, r"^voxel_decoder\.pre_transpose_conv\.(\d+)\.") // 2
+        fields["occupancy_channels"] = shape("voxel_decoder.pre_transpose_conv.0.weight")[0] // 2
+    fields["occupancy_token_stages"] = stages
+    fields["voxels"] = config_lib.VoxelGrid(
+        tuple(side * 2 ** (stages + 3) for side in shape("rssm.prior.query_embed_voxel")[2:]))
+    return fields
+
+
+def _count(state_dict: Mapping[str, np.ndarray], pattern: str) -> int:
+    """One more than the largest number that the pattern finds."""
+    found = [int(match[1]) for key in state_dict if (match := re.search(pattern, key))]
+    if not found:
+        raise KeyError(pattern)
+    return max(found) + 1

@@ -1,0 +1,57 @@
+"""python -m muvo_jax.interop.export_torch RUN OUT.safetensors: our weights under the reference's names and layouts."""
+
+from __future__ import annotations
+
+import dataclasses
+import pathlib
+import sys
+from typing import Annotated
+
+import jax
+import numpy as np
+import tyro
+
+from muvo_jax import command_line
+from muvo_jax.interop import names, safetensors_file
+from muvo_jax.training import checkpoint
+
+
+@dataclasses.dataclass(frozen=True)
+class Options:
+    """Writes a run's weights as a safetensors file that the authors' PyTorch model loads (strict=False).
+
+    strict=False, because counters and templates that no forward pass reads are not part of it.
+    """
+
+    run: Annotated[pathlib.Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
+    """The run's folder."""
+    out: Annotated[pathlib.Path, tyro.conf.Positional, tyro.conf.arg(metavar="OUT")]
+    """File to write, such as weights.safetensors."""
+    checkpoint: str = "latest"
+    """latest, best (validation loss) or a step."""
+
+
+_EXAMPLES = """
+python -m muvo_jax.interop.export_torch runs/paper-tr weights.safetensors
+"""
+
+
+def export(options: Options, show) -> None:
+    """Does what the command line asks for."""
+    chosen = int(options.checkpoint) if options.checkpoint.isdigit() else options.checkpoint
+    loaded = checkpoint.load_run(options.run, chosen)
+    variables = jax.tree.map(np.asarray, dict(loaded.variables))
+    state_dict = names.reference_state_dict(variables, loaded.config.model)
+    safetensors_file.save(options.out, state_dict, {
+        "variant": loaded.config.model.variant, "latent": loaded.config.model.latent,
+        "numerics": loaded.config.model.numerics, "step": str(loaded.step)})
+    show.line(f"wrote {options.out}: {len(state_dict)} tensors of {loaded.config.model.variant}, "
+              f"numerics={loaded.config.model.numerics}")
+
+
+def main() -> int:
+    return command_line.run(Options, export, program="interop.export_torch", examples=_EXAMPLES)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,47 @@
+"""The raw batch of packs p4 and p5 (what the authors' dataset gives), and the same as our model reads it."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from muvo_jax.interop import reference_preprocess as preprocess
+from muvo_jax.interop.parity import cases
+from muvo_jax.types import Batch
+
+IMAGE_SIZE, ROUTE_SIZE, RANGE_SIZE, VOXEL_SHAPE = (600, 960), (192, 192), (64, 1024), (192, 192, 64)
+
+
+def draw_raw(context: cases.Context, frames: int, later: int) -> dict[str, np.ndarray]:
+    """Arrays [1, frames, ...] in torch's layout; the actions have `later` more, to imagine with."""
+    draw = context.draw
+    intrinsics = np.broadcast_to(preprocess.intrinsics(IMAGE_SIZE), (1, frames, 3, 3)).astype(np.float32)
+    return {
+        "image": draw("full_image", (1, frames, 3, *IMAGE_SIZE), "image_u8"),
+        "route_map": draw("full_route", (1, frames, 3, *ROUTE_SIZE), "route_u8"),
+        "speed": draw("full_speed", (1, frames, 1), "speed"),
+        "range_view_pcd_xyzd": draw("full_rv", (1, frames, 4, *RANGE_SIZE), "range_view"),
+        "voxel": draw("full_voxel", (1, frames, 1, *VOXEL_SHAPE), "voxel2"),
+        "action": np.concatenate([draw("full_throttle", (1, frames + later, 1), "pm1"),
+                                  draw("full_steer", (1, frames + later, 1), "pm1")], axis=-1),
+        "intrinsics": intrinsics,
+    }
+
+
+def model_batch(raw: dict[str, np.ndarray], **more: Any) -> Batch:
+    """The batch of our model: channels last, cropped, not normalised (the model does that).
+
+    Args:
+      raw: from `draw_raw`.
+      more: further fields of the batch.
+    """
+    frames = raw["image"].shape[1]
+    image = np.moveaxis(preprocess.crop(raw["image"]), 2, -1)
+    cropped = preprocess.cropped_intrinsics(raw["intrinsics"])[:, 0]
+    return Batch(
+        action=raw["action"][:, :frames], is_first=np.arange(frames)[None] == 0, image=np.ascontiguousarray(image),
+        range_view=np.ascontiguousarray(np.moveaxis(raw["range_view_pcd_xyzd"], 2, -1)),
+        occupancy=raw["voxel"][:, :, 0], route_map=preprocess.nearest(raw["route_map"], (64, 64))[:, :, 0],
+        speed_mps=raw["speed"][..., 0], intrinsics=cropped,
+        camera_to_ego=preprocess.camera_to_ego()[None].astype(np.float32), **more)

@@ -1,0 +1,138 @@
+"""From a checkpoint of the authors to a run and back, without torch; what does not fit is named and leaves nothing."""
+
+import dataclasses
+import json
+import resource
+import time
+
+import jax
+import numpy as np
+import pytest
+import torch_writer
+
+import muvo_jax
+from muvo_jax import config as config_lib
+from muvo_jax import convert, presets
+from muvo_jax.interop import checkpoints, export_torch, names, packs, safetensors_file, weights_rule
+from muvo_jax.model import world_model
+from muvo_jax.training import screen
+
+# The tiny preset, with two things that no checkpoint tells as they are by default.
+TINY = dataclasses.replace(presets.get("tiny").model, numerics="reference", transformer_heads=8, token_channels=24,
+                           image_size=(64, 128), range_view=config_lib.RangeViewGeometry(rows=64, columns=64))
+
+
+def drawn_variables(config):
+    shapes = world_model.WorldModel(config).variable_shapes()
+    random = np.random.default_rng(0)
+    return jax.tree.map(lambda leaf: random.normal(size=leaf.shape).astype(np.float32), shapes)
+
+
+def checkpoint_of(state_dict):
+    """What Lightning saves, with things beside the network."""
+    inner = {f"model.{key}": value for key, value in state_dict.items()}
+    inner |= {"preprocess.image_mean": np.zeros((1, 3, 1, 1), np.float32),
+              "model.encoder.bn1.num_batches_tracked": np.array(9),
+              "model.encoder_layer.linear1.weight": np.zeros((4, 4), np.float32)}
+    return {"epoch": 1, "global_step": 70, "pytorch-lightning_version": "2.0.1",
+            "state_dict": torch_writer.tensors(inner),
+            "hyper_parameters": torch_writer.ForeignObject("fvcore.common.config", "CfgNode", {"STEPS": 5})}
+
+
+@pytest.fixture(scope="module", params=["1d", "2d"])
+def tiny(request):
+    """Configuration, variables and state_dict of a small model."""
+    config = dataclasses.replace(TINY, latent=request.param)
+    variables = drawn_variables(config)
+    return config, variables, names.reference_state_dict(variables, config)
+
+
+def run_convert(path, out):
+    return convert.convert(convert.Options(path, out), screen.Screen())
+
+
+def test_there_and_back(tiny, tmp_path):
+    config, variables, state_dict = tiny
+    torch_writer.write_zip(tmp_path / "a.ckpt", checkpoint_of(state_dict))
+    run_convert(tmp_path / "a.ckpt", tmp_path / "runs" / "a")
+    model, loaded = muvo_jax.load(tmp_path / "runs" / "a")
+    for field in ("numerics", "latent", "heads", "image_size", "range_view", "token_channels"):
+        assert getattr(model.config, field) == getattr(config, field)
+    jax.tree.map(np.testing.assert_array_equal, dict(loaded), variables)
+    report = json.loads((tmp_path / "runs" / "a" / convert.REPORT_FILE).read_text())
+    assert report["facts"]["global_step"] == 70 and len(report["mapped"]) == len(state_dict)
+    assert report["ignored"]["preprocess.image_mean"] == "constants of the preprocessing"
+    assert report["ignored"]["encoder.bn1.num_batches_tracked"] == "counter of torch's BatchNorm"
+    assert not report["missing"] + report["unexpected"] + report["wrong_shape"]
+    export_torch.export(export_torch.Options(tmp_path / "runs" / "a", tmp_path / "w.safetensors"), screen.Screen())
+    exported = safetensors_file.load(tmp_path / "w.safetensors")
+    assert exported.keys() == state_dict.keys()
+    for key, value in state_dict.items():
+        np.testing.assert_array_equal(exported[key], value)
+
+
+def test_half_precision_of_the_old_format(tiny, tmp_path):
+    _, variables, state_dict = tiny
+    halves = {key: value.astype(np.float16) for key, value in state_dict.items()}
+    torch_writer.write_legacy(tmp_path / "a.pth", torch_writer.tensors(halves))
+    run_convert(tmp_path / "a.pth", tmp_path / "run")
+    _, loaded = muvo_jax.load(tmp_path / "run")
+    expected = jax.tree.map(lambda leaf: leaf.astype(np.float16).astype(np.float32), variables)
+    jax.tree.map(np.testing.assert_array_equal, dict(loaded), expected)
+
+
+@pytest.mark.parametrize("damage, message", [
+    (lambda state: state.pop("rssm.prior.module.2.bias"), r"1 missing: rssm\.prior\.module\.2\.bias"),
+    (lambda state: state.update({"bev.weight": np.zeros(2, np.float32)}), r"1 unexpected: bev\.weight"),
+    (lambda state: state.update({"policy.fc.6.bias": np.zeros(3, np.float32)}),
+     r"1 of another shape: policy\.fc\.6\.bias \[3\]"),
+    (lambda state: state.pop("rssm.pre_gru_net.0.weight"), "expected a MUVO or MILE-style world model"),
+    (lambda state: (state.clear(), state.update({"fc.weight": np.zeros((2, 2), np.float32)})), r"such as fc\.weight"),
+])
+def test_what_does_not_fit_is_named_and_leaves_no_folder(damage, message, tmp_path):
+    state_dict = names.reference_state_dict(drawn_variables(TINY), TINY)
+    damage(state_dict)
+    torch_writer.write_zip(tmp_path / "a.ckpt", {"state_dict": torch_writer.tensors(
+        {f"model.{key}": value for key, value in state_dict.items()})})
+    with pytest.raises(checkpoints.CheckpointMismatch, match=rf"a\.ckpt: .*{message}"):
+        run_convert(tmp_path / "a.ckpt", tmp_path / "run")
+    assert [path.name for path in tmp_path.iterdir()] == ["a.ckpt"]
+
+
+def test_a_checkpoint_without_tensors_and_an_occupied_folder(tmp_path):
+    torch_writer.write_zip(tmp_path / "a.ckpt", {"epoch": 1})
+    with pytest.raises(checkpoints.CheckpointMismatch, match=r"a\.ckpt: expected a checkpoint with tensors.*epoch"):
+        run_convert(tmp_path / "a.ckpt", tmp_path / "run")
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run" / "diary.txt").write_text("mine")
+    with pytest.raises(FileExistsError, match="run"):
+        run_convert(tmp_path / "a.ckpt", tmp_path / "run")
+    assert (tmp_path / "run" / "diary.txt").read_text() == "mine"
+
+
+@pytest.mark.parametrize("name, latent", [("1d_RV_WOB_TR_voxel", "1d"), ("1d_RV_WOB_TR_novoxel", "1d"),
+                                          ("2d_RV_WOB_TR_voxel", "2d")])
+def test_released_models_are_recognised_by_their_shapes(name, latent):
+    zeros = {key: np.broadcast_to(np.float32(0), shape) for key, shape in packs.manifest(name).items()}
+    stored = checkpoints.Stored(packs.pathlib.Path(name), zeros, {}, {})
+    model = checkpoints.recognise(stored)
+    heads = tuple(head for head in config_lib.HEADS[:4] if head != "occupancy" or "novoxel" not in name)
+    assert model == config_lib.ModelConfig(numerics="reference", latent=latent, heads=heads)
+    assert checkpoints.published_name(model) and not names.match_state_dict(zeros, model).problems()
+
+
+@pytest.mark.slow
+def test_a_checkpoint_of_full_size(tmp_path):
+    """About 700 MB of the released 1D model's shapes: converted in 60 s and 4 GiB, and meeting the full-model pack."""
+    manifest = packs.manifest("1d_RV_WOB_TR_voxel")
+    state_dict = {f"model.{key}": weights_rule.make_param(key, shape) for key, shape in manifest.items()}
+    torch_writer.write_zip(tmp_path / "full.ckpt", {"state_dict": torch_writer.tensors(state_dict)})
+    assert (tmp_path / "full.ckpt").stat().st_size > 700e6
+    del state_dict
+    start_s = time.perf_counter()
+    run_convert(tmp_path / "full.ckpt", tmp_path / "run")
+    print(f"{time.perf_counter() - start_s:.1f} s, "
+          f"{resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2 ** 20:.2f} GiB at most")
+    _, variables = muvo_jax.load(tmp_path / "run")
+    drawn = weights_rule.make_param("features_combine.weight", manifest["features_combine.weight"])
+    np.testing.assert_array_equal(variables["params"]["fusion"]["combine"]["kernel"], drawn.T)

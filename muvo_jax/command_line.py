@@ -136,4 +136,5 @@ def open_data(config: config_lib.Config, show: screen.Screen) -> schema.Recordin
         with show.counter("recording the built-in town", "frames") as progress:
             folder = record.cached_town(config, progress)
         return sources.open_recording(folder)
-    return sources.open_recording(config.data.path, camera=config.data.camera)
+    return sources.open_recording(config.data.path, camera=config.data.camera,
+                                  skip_corrupt_shards=config.data.skip_corrupt_shards)

@@ -18,6 +18,7 @@ CAMERA_ENCODERS = ("wob", "bev")
 LATENTS = ("1d", "2d")
 BACKBONES = ("resnet18", "mobilevitv2_100")
 HEADS = ("image", "range_view", "occupancy", "action")
+ALL_HEADS = (*HEADS, "birds_eye")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -48,7 +49,8 @@ class ModelConfig:
     Attributes:
       fusion, lidar, camera, latent: the variant, see `variant`.
       numerics: "standard" follows the mathematics, "reference" the authors' code (DEVIATIONS.md lists the difference).
-      heads: what is decoded; a modality that the data lacks has no head.
+      heads: what is decoded; a modality that the data lacks has no head. "birds_eye", classes and instances on the
+        ground plan of the voxels, is for converted models: no recording holds its targets.
       route, speed: whether the planned route and the speed are inputs.
       navigation: whether the route's command, the next one and the GPS targets are inputs.
       backbone: of image and range view; pillars, route and the maps of fc and avg keep a ResNet-18.
@@ -127,7 +129,7 @@ class ModelConfig:
                             ("latent", LATENTS), ("backbone", BACKBONES)):
             check_choice(f"model.{name}", getattr(self, name), known)
         for head in self.heads:
-            check_choice("model.heads", head, HEADS)
+            check_choice("model.heads", head, ALL_HEADS)
         if any(side % 32 for side in self.image_size):
             raise ValueError(f"model.image_size {self.image_size}: rows and columns must be multiples of 32.")
         if self.range_view.rows % 32 or self.range_view.columns % 32:
@@ -142,7 +144,8 @@ class ModelConfig:
                              f"model.latent=2d (sine and cosine of three axes).")
         field = "occupancy_token_stages" if tokens else "occupancy_blocks"
         shrink = 2 ** (getattr(self, field) + 3)
-        if (tokens or "occupancy" in self.heads) and any(side % shrink for side in self.voxels.shape):
+        gridded = tokens or not {"occupancy", "birds_eye"}.isdisjoint(self.heads)
+        if gridded and any(side % shrink for side in self.voxels.shape):
             raise ValueError(f"model.voxels.shape {self.voxels.shape}: each side must be a multiple of {shrink} "
                              f"(2**({field} + 3)).")
         self._check_variant()
@@ -231,6 +234,7 @@ class DataConfig:
       context, horizon: evaluation observes `context` frames and imagines `horizon` more.
       town_seed, town_size: which town, and how much of it ("default", "tiny").
       cache_gib: decoded frames are kept in memory up to this size.
+      skip_corrupt_shards: leave damaged shards of a packed recording out, counted, instead of stopping.
     """
 
     path: str = "town"
@@ -242,6 +246,7 @@ class DataConfig:
     town_seed: int = 0
     town_size: str = "default"
     cache_gib: float = 1.5
+    skip_corrupt_shards: bool = False
 
     def __post_init__(self):
         for name in ("frames", "stride", "context", "horizon"):

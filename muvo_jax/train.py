@@ -152,7 +152,7 @@ def _heads(options: Options, heads: Sequence[str]) -> tuple[str, ...]:
     if options.occupancy and options.no_occupancy:
         raise ValueError("--occupancy and --no-occupancy contradict each other: give one of them.")
     wanted = {*heads, "occupancy"} if options.occupancy else set(heads) - {"occupancy"}
-    return tuple(head for head in config_lib.HEADS if head in wanted)
+    return tuple(head for head in config_lib.ALL_HEADS if head in wanted)
 
 
 def default_name(options: Options) -> str:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
+import math
 import pathlib
 
 import jax
@@ -14,12 +15,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from muvo_jax import config as config_lib
-from muvo_jax import presets, types
+from muvo_jax import geometry, presets, types
 from muvo_jax.data.town import settings
 from muvo_jax.data.town.simulator import Town
 from muvo_jax.metrics import points
 from muvo_jax.model import rollout, world_model
 from muvo_jax.objectives import kl, regression, scal
+from muvo_jax.ops import camera, frustum, pillars
 
 
 def gaussians(seed: int, frames: int) -> tuple[types.Gaussian, types.Gaussian]:
@@ -98,6 +100,29 @@ def chamfer_of_pixels(frame: dict[str, np.ndarray]) -> tuple[str, str]:
     return f"{float(np.asarray(returns).squeeze()):.3f}", f"{pixels:.3f}"
 
 
+def pillar_offsets() -> tuple[str, str]:
+    """Mean distance along x of points, evenly spread over the grid, to what a pillar takes for its centre (m)."""
+    grid = geometry.PillarGrid()
+    cloud = jnp.asarray(np.random.default_rng(0).uniform(-48, 48, (1, 4000, 3)), jnp.float32)
+    index, cell = pillars.pillar_indices(cloud, jnp.asarray([4000], jnp.int32), grid)
+    offsets = [pillars.decorate(cloud, index, cell, grid, swapped_corners=swapped)[..., 6] for swapped in (False, True)]
+    here, reference = (f"{float(jnp.abs(offset).mean()):.2f}" for offset in offsets)
+    return here, reference
+
+
+def lifted_share() -> tuple[str, str]:
+    """Share of the points on a camera's rays that fall into the bird's-eye grid, at the paper's size."""
+    grid, size = geometry.BirdsEyeGrid(), (40, 104)
+    cropped_px = np.array([[0, 0, 64], [0, 0, 138], [0, 0, 0]], np.float32)
+    intrinsics = camera.intrinsics_from_fov(960, 600, math.radians(100)) - cropped_px
+    pose = camera.level_camera_to_ego((1.0, 0.0, 2.0))
+    shares = []
+    for quirks in (False, True):
+        rays = frustum.frustum_points(intrinsics[None], pose[None], size, 8, grid.depth_bins, corners=quirks)
+        shares.append(f"{float((frustum.cell_indices(rays, grid, truncate=quirks) < grid.cells**2).mean()):.4f}")
+    return shares[0], shares[1]
+
+
 def posterior_memory() -> tuple[str, str]:
     """Mean change of the posterior's means where the mark of the state's tokens moves by N(0, 0.5), 2D town model."""
     changes = []
@@ -143,6 +168,8 @@ def rows() -> list[tuple[str, tuple[str, str]]]:
         ("L2 of xyz where everything is predicted at the origin, one town frame", masked_xyz(frame)),
         ("cross-entropy of p = 0.5 in seen free space, 0.9 elsewhere, one town frame", unknown_voxels(frame)),
         ("Chamfer (m) of a town frame to itself moved by 1 m", chamfer_of_pixels(frame)),
+        ("distance along x (m) of a point to its pillar's centre, evenly spread points", pillar_offsets()),
+        ("share of ray points inside the bird's-eye grid, paper size", lifted_share()),
     ]
 
 

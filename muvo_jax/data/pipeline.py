@@ -76,11 +76,14 @@ class TrainBatches:
     `get_state` after n batches and a new TrainBatches with that `start_state` give exactly the batches from n + 1 on.
     """
 
-    def __init__(self, frames: Frames, *, seed: int, batch: int | None = None, start_state: State | None = None):
+    def __init__(self, frames: Frames, *, seed: int, batch: int | None = None, start_state: State | None = None,
+                 process: int = 0, processes: int = 1):
         """Opens the stream.
 
         Args:
-          batch: windows per batch, by default config.train.batch.
+          batch: windows per batch over all processes, by default config.train.batch.
+          process, processes: which share of each batch is read here, such as jax.process_index() of
+            jax.process_count(). The order of the windows, and so the saved position, is the same for any number.
           start_state: from `get_state` of a stream with the same recording, seed and sizes.
 
         Raises:
@@ -90,11 +93,15 @@ class TrainBatches:
         windows = windows_lib.find_windows(frames.recording, "train", frames=data.frames, stride=data.stride)
         size = batch or frames.config.train.batch
         self.windows_per_epoch = len(windows)
+        if size % processes or not 0 <= process < processes:
+            raise schema.DataError(f"process {process} of {processes}: a batch of {size} windows needs a number of "
+                                   f"processes that divides it, and a process from 0 to that number - 1.")
+        share = slice(process * size // processes, (process + 1) * size // processes)
         self._identity = {"seed": seed, "windows": len(windows), "batch": size, "frames": data.frames,
                           "stride": data.stride}
         # There is no remainder to drop; without the flag Grain's length of batches of one overflows.
         dataset = grain.MapDataset.source(windows).seed(seed).shuffle().repeat().batch(
-            size, drop_remainder=True, batch_fn=frames.batch)
+            size, drop_remainder=True, batch_fn=lambda chosen: frames.batch(chosen[share]))
         options = grain.ReadOptions(num_threads=_READ_THREADS, prefetch_buffer_size=_READ_AHEAD)
         self._iterator = iter(dataset.to_iter_dataset(options))
         if start_state is not None:

@@ -6,7 +6,7 @@ import pathlib
 from collections.abc import Callable
 from typing import NamedTuple
 
-from muvo_jax.data import carla, files, kitti, plain, schema
+from muvo_jax.data import carla, files, kitti, plain, records, schema
 
 
 class Kind(NamedTuple):
@@ -28,6 +28,8 @@ class Kind(NamedTuple):
 
 
 KINDS = (
+    Kind("packed", f"a folder of shards with {records.MANIFEST_FILE}",
+         lambda path: (path / records.MANIFEST_FILE).is_file(), records.PackedRecording),
     Kind("plain", f"a folder with {plain.DESCRIPTION_FILE}",
          lambda path: (path / plain.DESCRIPTION_FILE).is_file(), plain.PlainRecording),
     Kind("KITTI raw", "<date>/<date>_drive_NNNN_sync folders, or one of them",
@@ -37,11 +39,13 @@ KINDS = (
 )
 
 
-def open_recording(path: pathlib.Path | str, *, camera: str = "") -> schema.Recording:
+def open_recording(path: pathlib.Path | str, *, camera: str = "",
+                   skip_corrupt_shards: bool = False) -> schema.Recording:
     """Opens a folder with the reader of its kind (the built-in town is a plain recording in its cache folder).
 
     Args:
       camera: which one, where the format records several; by default the reader's choice.
+      skip_corrupt_shards: of a packed recording; see records.PackedRecording.
 
     Raises:
       DataError: for a path that is missing, a file, empty or of no known kind (naming the kinds and what was found), or
@@ -62,5 +66,7 @@ def open_recording(path: pathlib.Path | str, *, camera: str = "") -> schema.Reco
             if camera and camera not in kind.cameras:
                 raise schema.DataError(f"{path}: a recording of kind {kind.name} has no camera {camera!r}"
                                        f"{' but ' + ', '.join(kind.cameras) if kind.cameras else '; it has one only'}.")
+            if kind.open is records.PackedRecording and skip_corrupt_shards:
+                return records.PackedRecording(path, corrupt="skip")
             return kind.open(path, camera=camera) if camera else kind.open(path)
     raise schema.DataError(f"data folder {path} is of no known kind. Known are {known}. Found {files.listing(path)}.")

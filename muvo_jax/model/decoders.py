@@ -13,6 +13,7 @@ from muvo_jax.nn import layers, norm
 from muvo_jax.ops import resample
 
 _PLANE_KERNELS = (5, 5, 6, 6, 6, 6)
+INSTANCE_CHANNELS = 3  # offset and centre
 
 
 def plane_start(size: tuple[int, ...]) -> tuple[tuple[int, ...], tuple[int, ...]]:
@@ -64,20 +65,33 @@ class PlaneDecoder(linen.Module):
         return out
 
 
+class BirdsEyeHead(linen.Module):
+    """[N, X, Y, C] -> [N, X, Y, features]: class logits, then offset (2) and centre (1, in (0, 1)) of instances."""
+
+    features: int
+    compute: layers.Compute = layers.Compute()
+
+    @linen.compact
+    def __call__(self, x: jax.Array) -> jax.Array:
+        dense = lambda features, name: layers.Dense(features, self.compute, name=name)(x)
+        return jnp.concatenate([dense(self.features - INSTANCE_CHANNELS, "segmentation"), dense(2, "offset"),
+                                jax.nn.sigmoid(dense(1, "center"))], axis=-1)
+
+
 class StyledConv(linen.Module):
-    """3x3x3 convolution, leaky ReLU 0.2, adaptive instance norm."""
+    """3x3x3 (3x3) convolution, leaky ReLU 0.2, adaptive instance norm."""
 
     features: int
     compute: layers.Compute = layers.Compute()
 
     @linen.compact
     def __call__(self, x: jax.Array, style: jax.Array) -> jax.Array:
-        x = jax.nn.leaky_relu(layers.Conv(self.features, (3, 3, 3), self.compute, name="conv")(x), 0.2)
+        x = jax.nn.leaky_relu(layers.Conv(self.features, (3,) * (x.ndim - 2), self.compute, name="conv")(x), 0.2)
         return norm.AdaptiveInstanceNorm(self.compute, name="norm")(x, style)
 
 
 class StyledUpBlock(linen.Module):
-    """Trilinear doubling, then two styled convolutions."""
+    """Linear doubling, then two styled convolutions."""
 
     features: int
     compute: layers.Compute = layers.Compute()
@@ -89,22 +103,28 @@ class StyledUpBlock(linen.Module):
         return StyledConv(self.features, self.compute, name="conv2")(x, style)
 
 
-class VoxelDecoder(linen.Module):
-    """Features -> class logits [N, X/scale, Y/scale, Z/scale, channels]: a learned constant grown under adaptive norms.
+class StyledDecoder(linen.Module):
+    """Features -> [N, *shape / scale, channels] over two or three axes: a learned constant grown under adaptive norms.
 
     `blocks` doublings at full width, then three with half, a quarter and an eighth of it.
+
+    Attributes:
+      constant_width: channels of the constant.
+      head: the layer that ends each scale.
     """
 
-    shape: tuple[int, int, int]
+    shape: tuple[int, ...]
     channels: int
+    constant_width: int
     width: int
     blocks: int
+    head: type[layers.Dense] | type[BirdsEyeHead] = layers.Dense
     compute: layers.Compute = layers.Compute()
 
     @linen.compact
     def __call__(self, features: jax.Array) -> dict[int, jax.Array]:
         start = tuple(side // 2 ** (self.blocks + 3) for side in self.shape)
-        constant = self.param("constant", layers.shape_only, (*start, 2 * self.width)).astype(self.compute.dtype)
+        constant = self.param("constant", layers.shape_only, (*start, self.constant_width)).astype(self.compute.dtype)
         x = jnp.broadcast_to(constant[None], (features.shape[0], *constant.shape))
         x = norm.AdaptiveInstanceNorm(self.compute, name="first_norm")(x, features)
         x = StyledConv(self.width, self.compute, name="first_conv")(x, features)
@@ -113,7 +133,7 @@ class VoxelDecoder(linen.Module):
         out = {}
         for scale, width in ((4, self.width // 2), (2, self.width // 4), (1, self.width // 8)):
             x = StyledUpBlock(width, self.compute, name=f"up_{scale}")(x, features)
-            out[scale] = layers.Dense(self.channels, self.compute, name=f"head_{scale}")(x).astype(jnp.float32)
+            out[scale] = self.head(self.channels, self.compute, name=f"head_{scale}")(x).astype(jnp.float32)
         return out
 
 

@@ -10,6 +10,8 @@ from flax import linen
 from muvo_jax.config import ModelConfig
 from muvo_jax.model import common, decoders, token_decoders, tokens
 
+BIRDS_EYE_CLASSES = 8
+
 
 @dataclasses.dataclass(frozen=True)
 class Head:
@@ -54,7 +56,17 @@ def _occupancy(config: ModelConfig, channels: int) -> linen.Module:
     if config.latent == "2d":
         return token_decoders.TokenDecoder(channels, 2 * width, width, config.occupancy_token_stages,
                                            common.compute(config))
-    return decoders.VoxelDecoder(config.voxels.shape, channels, width, config.occupancy_blocks, common.compute(config))
+    return decoders.StyledDecoder(config.voxels.shape, channels, 2 * width, width, config.occupancy_blocks,
+                                  compute=common.compute(config))
+
+
+def _birds_eye(config: ModelConfig, channels: int) -> linen.Module:
+    width, compute, head = config.decoder_channels, common.compute(config), decoders.BirdsEyeHead
+    if config.latent == "2d":
+        return token_decoders.TokenDecoder(channels, width, width, config.occupancy_token_stages, compute, head,
+                                           flat=True)
+    return decoders.StyledDecoder(config.voxels.shape[:2], channels, width, width, config.occupancy_blocks, head,
+                                  compute)
 
 
 def _action(config: ModelConfig, channels: int) -> linen.Module:
@@ -67,6 +79,7 @@ TABLE = {
     "range_view": Head(_range_view, 4, (1, 2, 4), "range_view", unit=lambda config: config.range_scale_m,
                        initial_bias=0.0),
     "occupancy": Head(_occupancy, 2, (1, 2, 4), "occupancy", initial_bias=0.0),
+    "birds_eye": Head(_birds_eye, BIRDS_EYE_CLASSES + decoders.INSTANCE_CHANNELS, (1, 2, 4), "occupancy"),
     "action": Head(_action, 2, (1,), "action"),
 }
 

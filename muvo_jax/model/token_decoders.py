@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 from flax import linen
 
+from muvo_jax.model import decoders
 from muvo_jax.nn import layers
 
 _STAGES = ((4, 2), (2, 4), (1, 8))  # scale, by what the width is divided
@@ -37,6 +38,8 @@ class TokenDecoder(linen.Module):
       first_width: of the first convolution.
       width: of the `stages` doublings, and what the last three divide.
       stages: doublings before the first output.
+      head: the layer that ends each scale.
+      flat: decode the ground plan, the largest value over the last of three axes.
     """
 
     channels: int
@@ -44,9 +47,13 @@ class TokenDecoder(linen.Module):
     width: int
     stages: int
     compute: layers.Compute = layers.Compute()
+    head: type[layers.Dense] | type[decoders.BirdsEyeHead] = layers.Dense
+    flat: bool = False
 
     @linen.compact
     def __call__(self, tokens: jax.Array) -> dict[int, jax.Array]:
+        if self.flat:
+            tokens = tokens.max(axis=-2)
         rank = tokens.ndim - 2
         x = jax.nn.elu(layers.Conv(self.first_width, (3,) * rank, self.compute, name="first")(tokens))
         for index in range(self.stages):
@@ -54,5 +61,5 @@ class TokenDecoder(linen.Module):
         out = {}
         for scale, divisor in _STAGES:
             x = _Doubling(self.width // divisor, 6, self.compute, name=f"grow_{scale}")(x)
-            out[scale] = layers.Dense(self.channels, self.compute, name=f"head_{scale}")(x).astype(jnp.float32)
+            out[scale] = self.head(self.channels, self.compute, name=f"head_{scale}")(x).astype(jnp.float32)
         return out

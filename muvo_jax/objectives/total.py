@@ -128,7 +128,7 @@ def _checked_targets(predictions: types.Predictions, batch: types.Batch,
     for head in heads:
         if head not in predictions:
             raise ValueError(f"losses: the model has the head {head!r}, the predictions have {sorted(predictions)}.")
-        if getattr(batch, head) is None:
+        if getattr(batch, head, None) is None:
             raise ValueError(f"losses: the model has the head {head!r}, but the batch has no {head}. "
                              f"Remove it from model.heads or train on a recording that has it.")
         scales = labels.SCALES if head in _SCALED_TERMS else (1,)

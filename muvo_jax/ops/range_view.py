@@ -13,6 +13,7 @@ import numpy as np
 from muvo_jax import config as config_lib
 
 NO_RETURN_M = -1.0
+BLOCK_POINTS = 8192  # work on this many at once stays in the processor's cache
 _SCATTER_ROUNDS = 8
 # Above the error of float32 angles in pixels: 4e-7 rad times columns / (2 pi) or rows / (field of view).
 _EDGE_PX = 2e-3
@@ -81,23 +82,36 @@ def nearest_of_cells(cell: np.ndarray, distance: np.ndarray, cells: int) -> np.n
       distance: floats [P], or anything that grows with it.
     """
     winner = np.full(cells, -1, np.int32)
-    point = np.flatnonzero(cell >= 0).astype(np.int32)
+    point = np.flatnonzero(cell >= 0)
+    target = cell[point].astype(np.intp)
     for _ in range(_SCATTER_ROUNDS):
-        winner[cell[point]] = point
-        point = point[distance[point] < distance[winner[cell[point]]]]
-        if not point.size:
+        winner[target] = point
+        nearer = np.flatnonzero(distance[point] < distance[winner[target]])
+        if not nearer.size:
             return winner
+        point, target = point[nearer], target[nearer]
     # NumPy keeps the last of repeated assignments, so the nearest point comes last, and of equals the last of all.
-    point = point[np.argsort(-distance[point], kind="stable")]
-    winner[cell[point]] = point
+    order = np.argsort(-distance[point], kind="stable")
+    winner[target[order]] = point[order]
     return winner
 
 
 def _nearest(points_m: np.ndarray, geometry: config_lib.RangeViewGeometry) -> tuple[np.ndarray, np.ndarray]:
     """Point number of each pixel, int32 [rows * columns], and the float64 range of each point, m."""
+    range_m = np.empty(len(points_m))
+    pixel = np.empty(len(points_m), np.int32)
+    for start in range(0, len(points_m), BLOCK_POINTS):
+        block = slice(start, start + BLOCK_POINTS)
+        _fill_pixels(points_m[block], geometry, pixel[block], range_m[block])
+    return nearest_of_cells(pixel, range_m, geometry.rows * geometry.columns), range_m
+
+
+def _fill_pixels(points_m: np.ndarray, geometry: config_lib.RangeViewGeometry, pixel: np.ndarray,
+                 range_m: np.ndarray) -> None:
+    """Writes the pixel (-1 for a point at the lidar) and the range of each point."""
     # In float64: two points on one ring of flat ground differ in range by less than float32 tells, and one must win.
     x, y, z = (points_m[:, axis] - np.float64(geometry.position_m[axis]) for axis in range(3))
-    range_m = np.sqrt(x * x + y * y + z * z)
+    np.sqrt(x * x + y * y + z * z, out=range_m)
     image = np.stack(_image_coordinates(x.astype(np.float32), y.astype(np.float32), z.astype(np.float32), geometry))
     whole = np.floor(image)
     # float32 angles decide all but the points at the edge of a pixel, which are taken again in float64.
@@ -105,10 +119,9 @@ def _nearest(points_m: np.ndarray, geometry: config_lib.RangeViewGeometry) -> tu
     edge = np.flatnonzero(at_edge[0] | at_edge[1])
     whole[:, edge] = np.floor(_image_coordinates(x[edge], y[edge], z[edge], geometry))
     row, column = whole.astype(np.int32)
-    pixel = np.minimum(np.maximum(row, 0), geometry.rows - 1) * np.int32(geometry.columns)
+    np.multiply(np.minimum(np.maximum(row, 0), geometry.rows - 1), np.int32(geometry.columns), out=pixel)
     pixel += np.minimum(np.maximum(column, 0), geometry.columns - 1)
     pixel[range_m == 0] = -1
-    return nearest_of_cells(pixel, range_m, geometry.rows * geometry.columns), range_m
 
 
 def _image_coordinates(x: np.ndarray, y: np.ndarray, z: np.ndarray,

@@ -54,24 +54,18 @@ def voxel_table(points_m: np.ndarray, tags: np.ndarray, grid: config_lib.VoxelGr
     range_view.check_points(points_m)
     if np.shape(tags) != points_m.shape[:1]:
         raise ValueError(f"tags: got shape {np.shape(tags)}, expected one for each of {len(points_m)} points.")
-    number = np.zeros(len(points_m), np.int32)
-    inside = np.ones(len(points_m), bool)
-    to_corner = np.zeros(len(points_m))  # squared, in voxels
-    for axis in (2, 1, 0):
-        place = (points_m[:, axis] - np.float64(grid.origin_m[axis])) / grid.voxel_size_m
-        index = np.floor(place)
-        inside &= (index >= 0) & (index < grid.shape[axis])
-        place -= index
-        to_corner += place * place
-        # Far coordinates would overflow; what is outside is masked in the end.
-        number = number * np.int32(grid.shape[axis]) + np.clip(index, 0, grid.shape[axis]).astype(np.int32)
-    number[~inside] = -1
+    number = np.empty(len(points_m), np.int32)
+    to_corner = np.empty(len(points_m))
+    for start in range(0, len(points_m), range_view.BLOCK_POINTS):
+        block = slice(start, start + range_view.BLOCK_POINTS)
+        number[block], to_corner[block] = _number_and_distance(points_m[block], grid)
     winner = range_view.nearest_of_cells(number, to_corner, int(np.prod(grid.shape)))
     voxel = np.flatnonzero(winner >= 0)
     tag = np.asarray(tags)[winner[voxel]].astype(np.uint16)
     if winning_tag is not None:
         has_winning = np.zeros(len(winner), bool)
-        has_winning[number[inside & (tags == winning_tag)]] = True
+        numbers = number[tags == winning_tag]
+        has_winning[numbers[numbers >= 0]] = True
         tag[has_winning[voxel]] = winning_tag
     columns, rows, _ = grid.shape
     plane, ix = np.divmod(voxel.astype(np.int32), np.int32(columns))
@@ -149,6 +143,23 @@ def voxel_centres(grid: config_lib.VoxelGrid) -> np.ndarray:
     axes = [origin + grid.voxel_size_m * (np.arange(count) + 0.5)
             for origin, count in zip(grid.origin_m, grid.shape, strict=True)]
     return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).astype(np.float32)
+
+
+def _number_and_distance(points_m: np.ndarray, grid: config_lib.VoxelGrid) -> tuple[np.ndarray, np.ndarray]:
+    """Column-major number of the voxel around each point, -1 outside, and the squared distance to its lower corner."""
+    number = np.zeros(len(points_m), np.int32)
+    inside = np.ones(len(points_m), bool)
+    to_corner = np.zeros(len(points_m))  # in voxels
+    for axis in (2, 1, 0):
+        place = (points_m[:, axis] - np.float64(grid.origin_m[axis])) / grid.voxel_size_m
+        index = np.floor(place)
+        inside &= (index >= 0) & (index < grid.shape[axis])
+        place -= index
+        to_corner += place * place
+        # Far coordinates would overflow; what is outside is masked in the end.
+        number = number * np.int32(grid.shape[axis]) + np.clip(index, 0, grid.shape[axis]).astype(np.int32)
+    number[~inside] = -1
+    return number, to_corner
 
 
 def _strided(origins_m: np.ndarray, stride: int) -> np.ndarray:

@@ -20,8 +20,6 @@ from muvo_jax.training import parallel as parallel_lib
 from muvo_jax.training import state as state_lib
 from muvo_jax.training import step as step_lib
 
-ROUTE_MAP_PX = 64
-
 
 @dataclasses.dataclass(frozen=True)
 class Prepared:
@@ -63,15 +61,14 @@ def expected_batch(config: config_lib.Config, windows: int, *, rewards: bool = T
     def timed(dtype, *shape) -> Any:
         return jax.ShapeDtypeStruct((*prefix, *shape), dtype)
 
-    geometry = model.range_view
-    return types.Batch(
-        action=timed(np.float32, 2), is_first=timed(np.bool_), image=timed(np.uint8, *model.image_size, 3),
-        range_view=timed(np.float32, geometry.rows, geometry.columns, 4),
-        occupancy=timed(np.uint8, *model.voxels.shape) if "occupancy" in model.heads else None,
-        route_map=timed(np.uint8, ROUTE_MAP_PX, ROUTE_MAP_PX) if model.route else None,
-        speed_mps=timed(np.float32) if model.speed else None,
-        reward=timed(np.float32) if rewards else None, is_terminal=timed(np.bool_) if rewards else None,
-        intrinsics=shape(np.float32, 3, 3), camera_to_ego=shape(np.float32, 4, 4))
+    fields = {name: timed(types.BATCH_FIELDS[name][0], *sizes) for name, sizes in world_model.inputs(model).items()}
+    fields["range_view"] = timed(np.float32, model.range_view.rows, model.range_view.columns, 4)
+    fields |= {"intrinsics": shape(np.float32, 3, 3), "camera_to_ego": shape(np.float32, 4, 4)}
+    if "occupancy" in model.heads:
+        fields["occupancy"] = timed(np.uint8, *model.voxels.shape)
+    if rewards:
+        fields |= {"reward": timed(np.float32), "is_terminal": timed(np.bool_)}
+    return types.Batch(action=timed(np.float32, 2), is_first=timed(np.bool_), **fields)
 
 
 def shapes_of(batch: types.Batch) -> types.Batch:

@@ -105,6 +105,22 @@ def test_batches_of_one_window_come_for_ever():
     assert all(batch.batch_size == 1 for batch in take(stream, 2 * stream.windows_per_epoch + 1))
 
 
+def test_processes_share_each_batch_and_any_number_of_them_resumes():
+    """Two processes read the halves of what one reads, and go on from its saved position."""
+    one = pipeline.train_batches(frames_of(), seed=0)
+    whole = speeds(take(one, 5))
+    halves = [pipeline.TrainBatches(frames_of(), seed=0, process=process, processes=2) for process in range(2)]
+    read = [speeds(take(half, 5)) for half in halves]
+    assert [left + right for left, right in zip(*read, strict=True)] == whole
+    assert halves[0].get_state()["identity"] == one.get_state()["identity"]
+    resumed = [pipeline.TrainBatches(frames_of(), seed=0, process=process, processes=2, start_state=one.get_state())
+               for process in range(2)]
+    left, right = (speeds(take(half, 1)) for half in resumed)
+    assert left[0] + right[0] == speeds(take(one, 1))[0]
+    with pytest.raises(schema.DataError, match="process 0 of 3: a batch of 2"):
+        pipeline.TrainBatches(frames_of(), seed=0, process=0, processes=3)
+
+
 def test_the_seed_decides_the_order():
     orders = [speeds(take(pipeline.train_batches(frames_of(), seed=seed), 6)) for seed in (0, 0, 1)]
     assert orders[0] == orders[1] != orders[2]

@@ -28,6 +28,7 @@ VARIANTS = {
     "2d_RV_BEV_TR": {"latent": "2d", "camera": "bev"},
     "2d_PP_WOB_TR": {"latent": "2d", "lidar": "pp"},
     "2d_measurements": {"latent": "2d", "navigation": True},
+    "2d_bevseg": {"latent": "2d", "heads": ("range_view", "birds_eye", "action")},
     "2d_mobilevit": {"latent": "2d", "backbone": "mobilevitv2_100", "heads": config_lib.HEADS},
 }
 

@@ -86,7 +86,8 @@ def decoded(context: cases.Context) -> Checks:
     plane = lambda size, channels: decoders.PlaneDecoder(size, channels, CONFIG.decoder_channels)
     yield cases.Check("policy/out", drawing.run(decoders.ActionDecoder(), state, where="decoders_action/")[1],
                       TOLERANCE)
-    voxels = decoders.VoxelDecoder(CONFIG.voxels.shape, 2, CONFIG.occupancy_channels, CONFIG.occupancy_blocks)
+    voxels = decoders.StyledDecoder(CONFIG.voxels.shape, 2, 2 * CONFIG.occupancy_channels, CONFIG.occupancy_channels,
+                                    CONFIG.occupancy_blocks)
     for module, rows, where, name, tolerance in (
             (plane(CONFIG.image_size, 3), state[:1], "decoders_image/", "rgb_decoder/rgb", TOLERANCE),
             (plane((64, 1024), 4), state, "decoders_range_view/", "lidar_re/lidar_reconstruction", TOLERANCE),

@@ -63,6 +63,7 @@ class ModelConfig:
       map_channels: of the maps that fusions "fc" and "avg" pool.
       token_channels, transformer_*: the fusion transformer.
       fused_channels: channels of each sensor's pooled vector after fusion.
+      keep_cells: fusion hands on every cell of the compressed maps instead of their mean.
       embedding_channels: size of the observation embedding.
       deterministic_channels, stochastic_channels, action_channels: the recurrent state-space model of the 1D latent.
       transition_layers: of the transformers that are prior and posterior of the 2D latent, whose tokens have
@@ -73,6 +74,8 @@ class ModelConfig:
         constant input has shape / 2**(blocks + 3) voxels.
       occupancy_token_stages: doublings at full width of the 2D latent's voxel decoder; the voxel tokens are a grid of
         shape / 2**(stages + 3).
+      first_guess: "training_mean": decoders draw the difference from the average training frame; see model/outputs.py.
+      range_view_points: "beams": x, y, z are drawn as the difference from the point along the pixel's beam.
       compute_dtype: of the matrix work; parameters, norms, softmax and losses stay float32.
       convolution: "auto" takes the forms of ops/conv.py that are fast on this backend, "xla" the plain ones (needed for
         forward-mode differentiation), "gemm" the CPU forms.
@@ -103,6 +106,7 @@ class ModelConfig:
     transformer_hidden_channels: int = 2048
     dropout: float = 0.1
     fused_channels: int = 512
+    keep_cells: bool = False
     measurement_channels: int = 16
     embedding_channels: int = 512
     deterministic_channels: int = 1024
@@ -114,6 +118,8 @@ class ModelConfig:
     occupancy_channels: int = 64
     occupancy_blocks: int = 3
     occupancy_token_stages: int = 1
+    first_guess: Literal["zero", "training_mean"] = "zero"
+    range_view_points: Literal["free", "beams"] = "free"
     compute_dtype: Literal["float32", "bfloat16"] = "float32"
     convolution: Literal["auto", "xla", "gemm"] = "auto"
     range_scale_m: float = 50.0
@@ -179,11 +185,13 @@ class ModelConfig:
 class LossConfig:
     """Weights of the loss terms (paper Eq. 1) at scale 1; scale f counts 1/f.
 
-    `image`, `range_xyz`, `range_depth` and `occupancy_*` apply per scale; 0 switches a term off. The Chamfer term looks
-    at `chamfer_points` returns of each side; a predicted return is a predicted range above `return_threshold_m`.
+    `image` (L1), `image_squared` (L2, an addition to the paper), `range_xyz`, `range_depth` and `occupancy_*` apply per
+    scale; 0 switches a term off. The Chamfer term looks at `chamfer_points` returns of each side; a predicted return is
+    a predicted range above `return_threshold_m`.
     """
 
     image: float = 0.1
+    image_squared: float = 0.0
     range_xyz: float = 0.1
     range_depth: float = 0.1
     occupancy_cross_entropy: float = 0.1
@@ -263,6 +271,9 @@ class TrainConfig:
       validate_every, checkpoint_every, preview_every: in steps; 0 means at the end only.
       validation_windows: windows of each split looked at during training (evaluate uses all of them).
       keep_last, keep_best: how many checkpoints stay.
+      decode_frames: how many frames of a window are decoded in a training step, drawn anew each time; 0 means all.
+      observe_frames: so many frames of a training window are observed, the rest imagined from the last of them; 0
+        observes all.
       parallel: "auto" uses shard_map over all devices where there is more than one.
     """
 
@@ -278,6 +289,8 @@ class TrainConfig:
     keep_best: int = 1
     parallel: Literal["auto", "pmap", "shard_map"] = "auto"
     remat: bool = False
+    decode_frames: int = 0
+    observe_frames: int = 0
 
 
 @dataclasses.dataclass(frozen=True)

@@ -10,7 +10,7 @@ Time: `action[t]` is applied from t to t+1.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import flax.struct
@@ -88,8 +88,12 @@ class Batch(_Indexable):
         return self.action.shape[1]
 
     def time_slice(self, start: int, stop: int) -> Batch:
-        """The same windows, restricted to frames start..stop-1; calibration has no time axis and stays."""
-        timed = {name: value[:, start:stop] for name, value in vars(self).items()
+        """The same windows, restricted to frames start..stop-1."""
+        return self.map_frames(lambda value: value[:, start:stop])
+
+    def map_frames(self, function: Callable[[ArrayLike], ArrayLike]) -> Batch:
+        """Applies `function` to every field with a time axis; calibration has none and stays."""
+        timed = {name: function(value) for name, value in vars(self).items()
                  if value is not None and name not in UNTIMED_FIELDS}
         return dataclasses.replace(self, **timed)
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import functools
+
 import jax
 import jax.numpy as jnp
 from flax import linen
@@ -12,18 +14,23 @@ from muvo_jax.nn import attention, layers, norm, resnet
 
 
 class Compression(linen.Module):
-    """[N, H, W, C] -> [N, features]: a halving block, a block (which halves too where `halvings` is 2), the mean."""
+    """[N, H, W, C] -> [N, features]: a halving block, a block (which halves too where `halvings` is 2), the mean.
+
+    Or all cells side by side, [N, H/2 * W/2 * features]: in a small preset the map has a handful of cells, and their
+    mean no longer says what stands left and what right.
+    """
 
     features: int
     compute: layers.Compute = layers.Compute()
     halvings: int = 1
+    keep_cells: bool = False
 
     @linen.compact
     def __call__(self, x: jax.Array, mode: norm.Mode) -> jax.Array:
         x = resnet.BasicBlock(self.features, self.compute, stride=2, project=True, name="block0")(x, mode)
         twice = self.halvings == 2
         x = resnet.BasicBlock(self.features, self.compute, 2 if twice else 1, twice, name="block1")(x, mode)
-        return jnp.mean(x, axis=(1, 2))
+        return x.reshape(x.shape[0], -1) if self.keep_cells else jnp.mean(x, axis=(1, 2))
 
 
 class TransformerFusion(linen.Module):
@@ -55,10 +62,9 @@ class TransformerFusion(linen.Module):
             compute, name="transformer")(jnp.concatenate(tokens, axis=1), keys)
         if config.latent == "2d":
             return mixed.astype(jnp.float32)
-        image_vector = Compression(config.fused_channels, compute, name="image_compression")(
-            mixed[:, :image_count].reshape(image_map.shape), mode)
-        lidar_vector = Compression(config.fused_channels, compute, name="lidar_compression")(
-            mixed[:, image_count:].reshape(lidar_map.shape), mode)
+        compress = functools.partial(Compression, config.fused_channels, compute, keep_cells=config.keep_cells)
+        image_vector = compress(name="image_compression")(mixed[:, :image_count].reshape(image_map.shape), mode)
+        lidar_vector = compress(name="lidar_compression")(mixed[:, image_count:].reshape(lidar_map.shape), mode)
         joined = jnp.concatenate([image_vector, lidar_vector, *measurements], axis=-1)
         return layers.Dense(config.embedding_channels, compute, name="combine")(joined).astype(jnp.float32)
 
@@ -109,3 +115,11 @@ class AverageFusion(PooledFusion):
 
 
 REGISTRY: dict[str, type[linen.Module]] = {"tr": TransformerFusion, "fc": ConcatenationFusion, "avg": AverageFusion}
+
+
+def initial_constants(config: ModelConfig) -> dict[str, float]:
+    """Path of a parameter -> its first value: a fresh fusion transformer hands its tokens through unmixed."""
+    if config.fusion != "tr":
+        return {}
+    return {f"fusion/transformer/layer{index}/{layer}/kernel": 0.0
+            for index in range(config.transformer_layers) for layer in ("self_attn/out_proj", "linear2")}

@@ -8,7 +8,7 @@ from collections.abc import Callable
 from flax import linen
 
 from muvo_jax.config import ModelConfig
-from muvo_jax.model import common, decoders, token_decoders, tokens
+from muvo_jax.model import common, decoders, outputs, token_decoders, tokens
 
 BIRDS_EYE_CLASSES = 8
 
@@ -85,7 +85,18 @@ TABLE = {
 
 
 def initial_constants(config: ModelConfig) -> dict[str, float]:
-    """Path of a parameter -> its first value, for the heads that this model has."""
-    return {f"decoders_{name}/head_{scale}/bias": head.initial_bias
-            for name, head in TABLE.items() if name in config.heads and head.initial_bias is not None
-            for scale in head.scales}
+    """Path of a parameter -> its first value, for the heads that this model has.
+
+    Where the average training frame is the first guess, the last layers start at zero and add nothing to it.
+    """
+    values: dict[str, float] = {}
+    for name, head in TABLE.items():
+        if name not in config.heads or head.initial_bias is None:
+            continue
+        for scale in head.scales:
+            path = f"decoders_{name}/head_{scale}"
+            if config.first_guess == "training_mean" and name in outputs.FIRST_GUESS_HEADS:
+                values |= {f"{path}/bias": 0.0, f"{path}/kernel": 0.0}
+            else:
+                values[f"{path}/bias"] = head.initial_bias
+    return values

@@ -19,7 +19,7 @@ import jax.numpy as jnp
 from flax import linen
 
 from muvo_jax.config import ModelConfig
-from muvo_jax.model import camera, fusion, heads, lidar, measurements, tokens, transition
+from muvo_jax.model import camera, fusion, heads, lidar, measurements, outputs, tokens, transition
 from muvo_jax.nn import init as init_lib
 from muvo_jax.nn import norm
 from muvo_jax.types import BATCH_FIELDS, UNTIMED_FIELDS, Batch, Gaussian, LatentState, Predictions, StepNoise, Variables
@@ -48,6 +48,9 @@ class Network(linen.Module):
         self.transition = transition.REGISTRY[config.latent](config)
         self.decoders = {name: head.build(config, head.channels) for name, head in heads.TABLE.items()
                          if name in config.heads}
+        if config.first_guess == "training_mean":
+            self.first_guess = {name: outputs.FirstGuess() for name in outputs.FIRST_GUESS_HEADS
+                                if name in config.heads}
 
     def encode(self, frames: dict[str, jax.Array], mode: norm.Mode, keys: jax.Array | None) -> jax.Array:
         measured = []
@@ -67,7 +70,10 @@ class Network(linen.Module):
         return self.transition.imagine_step(*args)
 
     def decode(self, features: jax.Array, names: tuple[str, ...]) -> Predictions:
-        return {name: self.decoders[name](self.read(features, name)) for name in names}
+        raw = {name: self.decoders[name](self.read(features, name)) for name in names}
+        if self.config.first_guess == "training_mean":
+            raw |= {name: guess(raw[name]) for name, guess in self.first_guess.items() if name in names}
+        return raw
 
     def read(self, features: jax.Array, head: str) -> jax.Array:
         """The part of the features that a head decodes: its group of tokens with the 2D latent."""
@@ -125,7 +131,8 @@ class WorldModel:
         """
         if batch is not None:
             self._frames(batch)
-        constants = {**heads.initial_constants(self.config), **transition.initial_constants(self.config)}
+        constants = {**heads.initial_constants(self.config), **transition.initial_constants(self.config),
+                     **fusion.initial_constants(self.config)}
         return init_lib.fill(self.variable_shapes(), key, constants)
 
     def encode(self, variables: Variables, batch: Batch, *, train: bool = False, keys: jax.Array | None = None,
@@ -219,7 +226,7 @@ class WorldModel:
             raise ValueError(f"decode: got features {list(features.shape)}, expected "
                              f"[{', '.join(map(str, ('...', *shape)))}] for the {self.config.latent} latent.")
         flat = self._apply(variables, "decode", features.reshape(-1, *shape), names)
-        return {name: {scale: _in_units(value, name, self.config).reshape(*lead, *value.shape[1:])
+        return {name: {scale: _finished(value, name, scale, self.config).reshape(*lead, *value.shape[1:])
                        for scale, value in scales.items()} for name, scales in flat.items()}
 
     def _apply(self, variables: Variables, method: str, *args, **options) -> Any:
@@ -256,7 +263,9 @@ def inputs(config: ModelConfig) -> dict[str, tuple[int, ...]]:
     return fields
 
 
-def _in_units(value: jax.Array, name: str, config: ModelConfig) -> jax.Array:
+def _finished(value: jax.Array, name: str, scale: int, config: ModelConfig) -> jax.Array:
+    if name == "range_view" and config.range_view_points == "beams":
+        value = outputs.along_beams(value, scale, config)
     unit = heads.TABLE[name].unit(config)
     return value if unit == 1.0 else value * unit
 

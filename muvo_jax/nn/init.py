@@ -8,7 +8,7 @@
 | seed_kernel, transposed_kernel | uniform, variance 1.5 / (inputs that reach one output); their bias 0 |
 | bias of an adaptive norm's style map | 1 for the scale, 0 for the shift |
 | GRU kernels and biases | uniform within 1 / sqrt(hidden channels) |
-| scale of a norm; its bias | 1; 0 |
+| scale of the norm that ends a residual branch (bn2), of another norm; its bias | 0, 1; 0 |
 | constant and query_*; type_embedding | standard normal; 0 |
 | running mean; running variance | 0; 1 |
 
@@ -68,7 +68,7 @@ def _leaf(path: tuple[str, ...], siblings: Mapping[str, tuple[int, ...]], random
     if leaf == "constant" or leaf.startswith("query_"):
         return random.standard_normal(shape, np.float32)
     if leaf == "scale":
-        return np.ones(shape, np.float32)
+        return np.zeros(shape, np.float32) if path[-2] == "bn2" else np.ones(shape, np.float32)
     if leaf == "bias" and path[-2] == "style":
         return np.repeat(np.array([1, 0], np.float32), shape[0] // 2)
     if leaf in ("type_embedding", "bias"):

@@ -17,7 +17,7 @@ from muvo_jax import types
 from muvo_jax.objectives import chamfer, kl, labels, regression, scal
 
 _SCALED_TERMS = {
-    "image": ("image",),
+    "image": ("image", "image_squared"),
     "range_view": ("range_xyz", "range_depth"),
     "occupancy": ("occupancy_cross_entropy", "occupancy_semantic_scal", "occupancy_geometric_scal"),
 }
@@ -62,6 +62,7 @@ def loss_sums(predictions: types.Predictions, batch: types.Batch, observed: type
     if "image" in model.heads:
         for scale, target in labels.image_labels(targets["image"]).items():
             sums[f"image_{scale}"] = regression.l1_sums(predictions["image"][scale], target)
+            sums[f"image_squared_{scale}"] = regression.l2_sums(predictions["image"][scale], target)
     if "range_view" in model.heads:
         sums |= _range_view_sums(predictions["range_view"], targets["range_view"], keys, model, loss)
     if "occupancy" in model.heads:

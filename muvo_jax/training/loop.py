@@ -17,7 +17,7 @@ import jax
 from muvo_jax import config as config_lib
 from muvo_jax import types
 from muvo_jax.data import pipeline, prepare, schema
-from muvo_jax.training import checkpoint, host, integrity, preparation, run_folder, screen, validation
+from muvo_jax.training import checkpoint, first_guess, host, integrity, preparation, run_folder, screen, validation
 
 Preview = Callable[[pathlib.Path, validation.Validator, types.Variables, str], None]
 
@@ -87,6 +87,8 @@ def train(job: Job, show: screen.Screen) -> Outcome:
         run_folder.create(job.folder, config, job.resume_command)
     keeper = checkpoint.Checkpoints(job.folder, keep_last=config.train.keep_last, keep_best=config.train.keep_best)
     state, done, data_state = _resume(job, show, keeper, config, ready) if job.resume else (ready.state, 0, None)
+    if not done and config.model.first_guess == "training_mean":
+        state = first_guess.fill(state, validation.training_sums(frames), config.model, ready.step.plan)
     if data_state is not None:
         source = pipeline.train_batches(frames, seed=config.train.seed, batch=windows_per_step(config),
                                         start_state=data_state)

@@ -26,6 +26,7 @@ from muvo_jax.training import parallel as parallel_lib
 from muvo_jax.training import state as state_lib
 
 Metrics = dict[str, types.Array]
+_DECODE_SITE, _IMAGINE_SITE = 0xDEC0, 0x1A61  # separate these draws from all others made with the same sample key
 _VALIDATION_STEP = 2**31 - 1  # folded into the key where training folds its step in; no run gets there
 
 
@@ -163,7 +164,7 @@ def sample_keys(run_key: types.Array, step: int | types.Array, micro_batch: int 
 
 def forward(params: Any, batch_stats: Any, batch: types.Batch, keys: types.Array, *, model: world_model.WorldModel,
             config: config_lib.Config, train: bool, axis_name: str | None) -> tuple[types.Array, tuple[Metrics, Any]]:
-    """Observes a window, decodes every frame and scores it.
+    """Observes a window, decodes its frames (in training those that the config asks for) and scores them.
 
     Args:
       params, batch_stats: the model's variables.
@@ -178,18 +179,51 @@ def forward(params: Any, batch_stats: Any, batch: types.Batch, keys: types.Array
     """
     maybe_remat = jax.checkpoint if config.train.remat else lambda function: function
     variables = {"params": params, "batch_stats": batch_stats}
+    seen = min(config.train.observe_frames or batch.frames, batch.frames) if train else batch.frames
     observe = functools.partial(rollout.observe_window, model, train=train, axis_name=axis_name)
-    observed, batch_stats = maybe_remat(observe)(variables, batch, keys)
+    observed, batch_stats = maybe_remat(observe)(variables, batch.time_slice(0, seen), keys)
+    features = observed.states.features
+    if train:
+        features = _and_imagined(model, variables, observed, batch.action, keys)
+        features, batch = _some_frames(features, batch, keys, config.train.decode_frames)
     predictions: types.Predictions = {}
     for head in model.config.heads:
         decode = functools.partial(model.decode, heads=(head,))
-        predictions |= maybe_remat(decode)(variables, observed.states.features)
+        predictions |= maybe_remat(decode)(variables, features)
     terms = total.losses(predictions, batch, observed, model=model.config, loss=config.loss, keys=keys,
                          axis_name=axis_name)
     metrics = dict(terms)
     if batch.image is not None and "image" in predictions:
         metrics["psnr_db"] = _mean(image_metrics.frame_psnr_db(predictions["image"][1], batch.image), axis_name)
     return terms["total"], (metrics, batch_stats)
+
+
+def _and_imagined(model: world_model.WorldModel, variables: types.Variables, observed: types.Observed,
+                  action: types.ArrayLike, keys: types.Array) -> types.Array:
+    """Features of all frames of a window: the observed ones, then those that follow from the last one's state.
+
+    The loss of a decoded frame then also teaches prediction over several steps, beside the KL divergence over one.
+    """
+    seen = observed.states.deterministic.shape[1]
+    if seen == action.shape[1]:
+        return observed.states.features
+    dream_keys = jax.vmap(jax.random.fold_in, (0, None))(keys, _IMAGINE_SITE)
+    dream = rollout.imagine(model, variables, dream_keys, observed.last, action[:, seen - 1:-1])
+    return jnp.concatenate([observed.states.features, dream.features], axis=1)
+
+
+def _some_frames(features: types.Array, batch: types.Batch, keys: types.Array,
+                 count: int) -> tuple[types.Array, types.Batch]:
+    """Of each window the `count` frames that are decoded, drawn anew in every step; 0 or T and more take all of them.
+
+    Neighbouring frames look alike: decoding a few of more windows teaches more at the same cost.
+    """
+    if count == 0 or count >= batch.frames:
+        return features, batch
+    draw = lambda key: jax.random.permutation(jax.random.fold_in(key, _DECODE_SITE), batch.frames)[:count]
+    chosen = jax.vmap(draw)(keys)
+    pick = jax.vmap(lambda leaf, index: leaf[index])
+    return pick(features, chosen), batch.map_frames(lambda leaf: pick(leaf, chosen))
 
 
 def _mean(values: types.Array, axis_name: str | None) -> types.Array:

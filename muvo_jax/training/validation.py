@@ -58,10 +58,16 @@ def windows(frames: pipeline.Frames, split: str, count: int) -> Iterator[tuple[t
 
 def training_mean(frames: pipeline.Frames, most_frames: int = TRAINING_MEAN_FRAMES) -> tuple[baselines.Frames, int]:
     """The mean training frame over at most `most_frames` evenly spread frames, and how many went in."""
+    mean = training_sums(frames, most_frames)
+    return mean.prediction(), mean.frames
+
+
+def training_sums(frames: pipeline.Frames, most_frames: int = TRAINING_MEAN_FRAMES) -> baselines.TrainingMean:
+    """The sums behind `training_mean`."""
     mean = baselines.TrainingMean()
     for entry in pipeline.evaluation_batches(frames, "train", windows=most_frames, length=1):
         mean = mean.add(jax.tree.map(np.asarray, entry.batch)[: entry.count])
-    return mean.prediction(), mean.frames
+    return mean
 
 
 def text(numbers: Mapping[str, float]) -> str:

@@ -17,6 +17,7 @@ SHAPES = {
         "up": {"transposed_kernel": shape(6, 6, 16, 8), "bias": shape(8)},
         "style": {"kernel": shape(20, 6), "bias": shape(6)},
         "bn1": {"scale": shape(4), "bias": shape(4)},
+        "bn2": {"scale": shape(4), "bias": shape(4)},
     },
     "batch_stats": {"bn1": {"mean": shape(4), "var": shape(4)}},
 }
@@ -33,6 +34,7 @@ def test_rules():
     np.testing.assert_array_equal(params["up"]["bias"], 0)
     np.testing.assert_array_equal(params["style"]["bias"], [1, 1, 1, 0, 0, 0])
     np.testing.assert_array_equal(params["bn1"]["scale"], 1)
+    np.testing.assert_array_equal(params["bn2"]["scale"], 0)
     np.testing.assert_array_equal(filled["batch_stats"]["bn1"]["var"], 1)
 
 

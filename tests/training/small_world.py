@@ -42,6 +42,9 @@ class SmallNetwork(linen.Module):
     def observe_step(self, *args):
         return self.transition.observe_step(*args)
 
+    def imagine_step(self, *args):
+        return self.transition.imagine_step(*args)
+
     def decode(self, features, names):
         shapes = head_shapes(self.config)
         return {name: {scale: self.heads[name][scale](features).reshape(*features.shape[:-1], *shape)
@@ -86,6 +89,9 @@ class SmallWorld:
     def observe_step(self, variables, *args):
         return SmallNetwork(self.config).apply(variables, *args, method="observe_step")
 
+    def imagine_step(self, variables, *args):
+        return SmallNetwork(self.config).apply(variables, *args, method="imagine_step")
+
     def decode(self, variables, features, heads=None):
         names = self.config.heads if heads is None else heads
         return SmallNetwork(self.config).apply(variables, features, names, method="decode")
@@ -102,15 +108,18 @@ def head_shapes(config):
 
 
 def make_config(accumulate=1, **model):
-    """The tiny preset for WINDOWS windows an update, with everything random and every loss term switched on."""
+    """The tiny preset for WINDOWS windows an update, with everything random and every loss term switched on.
+
+    Of three frames the last is imagined, and two are decoded.
+    """
     config = presets.tiny()
     return dataclasses.replace(
         config,
         model=dataclasses.replace(config.model, dropout=0.2, prior_dropout=0.5, **model),
         data=dataclasses.replace(config.data, frames=3),
-        train=dataclasses.replace(config.train, batch=WINDOWS // accumulate),
+        train=dataclasses.replace(config.train, batch=WINDOWS // accumulate, observe_frames=2, decode_frames=2),
         optimizer=dataclasses.replace(config.optimizer, accumulate=accumulate),
-        loss=dataclasses.replace(config.loss, chamfer=0.1, chamfer_points=16))
+        loss=dataclasses.replace(config.loss, image_squared=0.1, chamfer=0.1, chamfer_points=16))
 
 
 def make_batch(model_config, frames=3, seed=0):

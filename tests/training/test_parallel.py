@@ -15,7 +15,7 @@ import pytest
 import small_world
 
 from muvo_jax import config as config_lib
-from muvo_jax.model import world_model
+from muvo_jax.model import rollout, world_model
 from muvo_jax.training import optimizer as optimizer_lib
 from muvo_jax.training import parallel as parallel_lib
 from muvo_jax.training import state as state_lib
@@ -184,3 +184,49 @@ def world_model_setting():
 @functools.cache
 def world_model_gradients_of_one_device():
     return gradients_under("single", *world_model_setting())
+
+
+def test_some_frames_of_each_window_are_decoded_and_others_in_the_next_step():
+    _, _, batch, _ = setting(heads=FEW)
+    features = np.arange(small_world.WINDOWS * 3, dtype=np.float32).reshape(small_world.WINDOWS, 3, 1)
+    draws = []
+    for step in (0, 0, 1):
+        keys = step_lib.sample_keys(jax.random.key(1), step, 0, small_world.WINDOWS, None)
+        picked, some = step_lib._some_frames(features, batch, keys, 2)
+        frames = np.asarray(picked[..., 0], np.int64) - 3 * np.arange(small_world.WINDOWS)[:, None]
+        assert frames.shape == (small_world.WINDOWS, 2) and (frames[:, 0] != frames[:, 1]).all()
+        for window, chosen in enumerate(frames):
+            np.testing.assert_array_equal(some.action[window], batch.action[window, chosen])
+            np.testing.assert_array_equal(some.image[window], batch.image[window, chosen])
+        draws.append(frames)
+    np.testing.assert_array_equal(draws[0], draws[1])
+    assert (draws[0] != draws[2]).any()
+    everything, same = step_lib._some_frames(features, batch, keys, 0)
+    assert everything is features and same is batch
+
+
+def test_imagined_frames_follow_from_the_last_observed_one():
+    model, config, batch, state = setting(heads=FEW)
+    keys = step_lib.sample_keys(jax.random.key(1), 0, 0, small_world.WINDOWS, None)
+    observed, _ = rollout.observe_window(model, state.variables, batch.time_slice(0, 2), keys, train=True)
+    features = step_lib._and_imagined(model, state.variables, observed, batch.action, keys)
+    # By hand: action[1] leads from the last observed frame, 1, to frame 2; h does not depend on the noise.
+    noise = jnp.zeros_like(observed.last.stochastic)
+    expected, _ = model.imagine_step(state.variables, noise, batch.action[:, 1], observed.last)
+    deterministic = config.model.deterministic_channels
+    np.testing.assert_array_equal(features[:, :2], observed.states.features)
+    np.testing.assert_allclose(features[:, 2, :deterministic], expected.deterministic, rtol=1e-5, atol=1e-6)
+
+
+def test_only_the_observed_frames_reach_the_encoder():
+    model, config, batch, state = setting(heads=FEW)
+    keys = step_lib.sample_keys(jax.random.key(1), 0, 0, small_world.WINDOWS, None)
+    statistics = lambda some: step_lib.forward(state.params, state.batch_stats, some, keys, model=model, config=config,
+                                               train=True, axis_name=None)[1][1]
+    unseen = batch.replace(range_view=np.concatenate([batch.range_view[:, :2], 0 * batch.range_view[:, 2:]], axis=1))
+    seen = batch.replace(range_view=np.concatenate([0 * batch.range_view[:, :2], batch.range_view[:, 2:]], axis=1))
+    before = jax.tree.leaves(statistics(batch))
+    for one, other in zip(before, jax.tree.leaves(statistics(unseen)), strict=True):
+        np.testing.assert_array_equal(one, other)
+    assert any((np.asarray(one) != np.asarray(other)).any()
+               for one, other in zip(before, jax.tree.leaves(statistics(seen)), strict=True))

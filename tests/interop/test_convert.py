@@ -123,7 +123,7 @@ def test_released_models_are_recognised_by_their_shapes(name, latent):
 
 @pytest.mark.slow
 def test_a_checkpoint_of_full_size(tmp_path):
-    """About 700 MB of the released 1D model's shapes: converted in 60 s and 4 GiB, and meeting the full-model pack."""
+    """About 700 MB in the released 1D model's shapes, converted and loaded; prints seconds and peak memory."""
     manifest = packs.manifest("1d_RV_WOB_TR_voxel")
     state_dict = {f"model.{key}": weights_rule.make_param(key, shape) for key, shape in manifest.items()}
     torch_writer.write_zip(tmp_path / "full.ckpt", {"state_dict": torch_writer.tensors(state_dict)})

@@ -153,7 +153,7 @@ def is_whole(path: pathlib.Path) -> bool:
 
 def carved_occupancy(depth_m: np.ndarray, points_m: np.ndarray, intrinsics: np.ndarray, camera_to_ego: np.ndarray,
                      lidar_position_m: tuple[float, float, float], grid: config_lib.VoxelGrid, *,
-                     keep: Callable[[np.ndarray], np.ndarray] = lambda points_m: points_m) -> np.ndarray:
+                     keep: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
     """The occupancy of one frame.
 
     Every pixel and every point occupies. Of the pixels, only so many carve that their rays, at the far end of the grid,
@@ -205,6 +205,9 @@ def _survey(path: pathlib.Path, rule: str) -> tuple[Rig, dict[pathlib.Path, list
 def _survey_plain(path: pathlib.Path, rule: str) -> tuple[Rig, dict[pathlib.Path, list[Frame]]]:
     toml_path = path / plain.DESCRIPTION_FILE
     header = plain.read_header(path)
+    if "voxels" not in header:
+        raise schema.DataError(f"{toml_path}: no section [voxels], the grid to fill; add one, such as [voxels] shape = "
+                               f"[192, 192, 64], voxel_size_m = 0.5, origin_m = [-48.0, -48.0, -6.0].")
     camera, lidar, grid = (description.section(header, name, toml_path, required=True)
                            for name in ("camera", "lidar", "voxels"))
     runs = {}
@@ -254,8 +257,8 @@ def _content(rig: Rig, frame: Frame) -> bytes:
             file = io.BytesIO()
             np.save(file, _reference_table(rig, frame, depth * carla_files.DEPTH_RANGE_M, tags, scan))
             return file.getvalue()
+        keep: Callable[[np.ndarray], np.ndarray] = _without_own_car
         depth_m, points_m = np.where(depth < 1.0, depth * carla_files.DEPTH_RANGE_M, np.inf), scan.points_m
-        keep = _without_own_car
     else:
         depth_m = recorder.decode_depth(files.read_image(frame.depth, None))
         points_m = files.read_npz(frame.points, "points_m").astype(np.float32)
@@ -263,7 +266,7 @@ def _content(rig: Rig, frame: Frame) -> bytes:
             raise schema.DataError(f"{frame.depth}, {frame.points}: depth of shape {list(depth_m.shape)}, points of "
                                    f"{list(points_m.shape)}; expected [H, W] and [N, 3].")
         points_m = files.finite_points(points_m, frame.points)
-        keep = lambda kept_m: kept_m
+        keep = _all
     intrinsics, camera_to_ego = _pinhole(rig.camera, depth_m.shape, frame.depth)
     if rig.rule == "reference":
         seen_m = camera_ops.depth_to_points(depth_m, intrinsics, camera_to_ego)
@@ -287,11 +290,16 @@ def _reference_table(rig: Rig, frame: Frame, depth_m: np.ndarray, tags: np.ndarr
             raise schema.DataError(f"{carla.SENSORS_FILE}: the reference rule knows only level cameras with a centred "
                                    f"principal point. Use the rule {RULES[0]}.")
         fov_rad = 2.0 * math.atan(0.5 * depth_m.shape[1] / float(intrinsics[0, 0]))
-        position_m = tuple(map(float, camera_to_ego[:3, 3]))
+        x_m, y_m, z_m = map(float, camera_to_ego[:3, 3])
+        position_m = (x_m, y_m, z_m)
     seen_m, pixel = camera_ops.reference_depth_points(depth_m, fov_rad, position_m)
     points_m, hit = np.concatenate([seen_m, scan.points_m]), np.concatenate([tags.reshape(-1)[pixel], scan.tags])
     kept = ~carla_files.in_ego_box(points_m)
     return voxel_ops.voxel_table(points_m[kept], hit[kept], rig.grid, winning_tag=carla_files.ROAD_LINE)
+
+
+def _all(points_m: np.ndarray) -> np.ndarray:
+    return points_m
 
 
 def _without_own_car(points_m: np.ndarray) -> np.ndarray:

@@ -102,6 +102,10 @@ def test_missing_sensors_are_told_before_anything_is_written(recording, tmp_path
     with pytest.raises(schema.DataError, match="no frame has a lidar scan"):
         voxelizing.voxelize(recording)
     assert not list(recording.glob("*/*/occupancy"))
+    header = recording / plain.DESCRIPTION_FILE
+    header.write_text(header.read_text().partition("[voxels]")[0])
+    with pytest.raises(schema.DataError, match=r"no section \[voxels\], the grid to fill; add one"):
+        voxelizing.voxelize(recording)
     with pytest.raises(schema.DataError, match="is no recording whose occupancy can be made"):
         voxelizing.voxelize(tmp_path / "elsewhere")
 

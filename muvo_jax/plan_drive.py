@@ -1,4 +1,4 @@
-"""python -m muvo_jax.plan_drive RUN: let a trained world model drive in the built-in town, by planning in imagination."""
+"""python -m muvo_jax.plan_drive RUN: a trained world model drives in the built-in town, by planning in imagination."""
 
 from __future__ import annotations
 
@@ -125,8 +125,8 @@ def planner_of(options: Options) -> tuple[str, planners.PlannerConfig]:
 
 
 def town_simulator(town: simulator.Town, config: config_lib.Config) -> closed_loop.Simulator:
-    """The town at the model's rate: an action is held for data.stride periods; the expert settles in first, as it does in
-    recordings."""
+    """The town at the model's rate: an action is held for data.stride periods. As in recordings, the expert first
+    settles in."""
     def reset(seed):
         state = town.reset(seed)
         for _ in range(record.WARM_UP_FRAMES):
@@ -179,8 +179,8 @@ def film(loaded: checkpoint.LoadedRun, town: simulator.Town, drive: closed_loop.
         truth = sheets.View(seen["image"], seen["range_view"], town.occupancy(seen))
         columns = [("town", truth), ("world model, now", views[0][index]),
                    (f"imagined under the plan, in {options.horizon * scene.frame_s:.1f} s", views[1][index])]
-        caption = (f"{index * scene.frame_s:4.1f} s   {3.6 * float(moment.state.speed_mps):3.0f} km/h   expected return "
-                   f"{float(moment.memory.value):+.2f}")
+        caption = (f"{index * scene.frame_s:4.1f} s   {3.6 * float(moment.state.speed_mps):3.0f} km/h   "
+                   f"expected return {float(moment.memory.value):+.2f}")
         pictures.append(sheets.dream_frame(columns, scene, badge="observed", caption=caption, action=moment.action))
     return pictures
 

@@ -169,7 +169,8 @@ def planning_driver(simulator: Simulator, environment: environment_lib.Environme
     if horizon < 1:
         raise ValueError(f"planning_driver: horizon is {horizon}; it must be at least 1.")
     if abs(simulator.step_s - environment.step_s) > 1e-6:
-        raise ValueError(f"planning_driver: the simulator steps {simulator.step_s} s, the model {environment.step_s} s.")
+        raise ValueError(f"planning_driver: the simulator steps {simulator.step_s} s, the model "
+                         f"{environment.step_s} s.")
 
     def driver(key, memory, state, previous):
         key_filter, key_plan = jax.random.split(key)
@@ -178,23 +179,23 @@ def planning_driver(simulator: Simulator, environment: environment_lib.Environme
                                 jnp.float32(0))
         observation = {name: np.asarray(value)[None] for name, value in simulator.observe(state).items()}
         memory = plan_step(environment, planner, config, variables, key_plan, memory, observation, previous[None],
-                           jnp.float32(temperature), jnp.float32(discount))
+                           jnp.float32(temperature), discount)
         return memory, np.asarray(memory.plan[0])
 
     return driver
 
 
-@functools.partial(jax.jit, static_argnames=("environment", "planner", "config"))
+@functools.partial(jax.jit, static_argnames=("environment", "planner", "config", "discount"))
 def plan_step(environment: environment_lib.Environment, planner: str, config: planners.PlannerConfig,
               variables: Variables, key: Array, memory: PlanMemory, observation: Mapping[str, Array],
-              previous_action: Array, temperature: Array, discount: Array) -> PlanMemory:
+              previous_action: Array, temperature: Array, discount: float) -> PlanMemory:
     """Filters one observation (each field [1, ...]) and plans from there on. The latents are means, not samples."""
     filtered = live.observe_step(environment.model, variables, memory.live, observation, previous_action,
                                  sampled=False)
     speed_mps, route_map = observation["speed_mps"], observation.get("route_map")
     bank = environment_lib.StartBank(filtered.latent, speed_mps, route_map)
     horizon = memory.plan.shape[0]
-    params = environment.params(variables, bank, horizon).replace(temperature=temperature)
+    params = dataclasses.replace(environment.params(variables, bank, horizon), temperature=temperature)
     state = environment_lib.EnvState(filtered.latent[0], kinematics.at_rest_of_frame(speed_mps[0]), jnp.int32(0),
                                      jnp.int32(0), jnp.float32(0), jnp.bool_(False))
     objective = planners.imagined_returns(environment, params, state, discount=discount)

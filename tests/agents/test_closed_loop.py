@@ -56,7 +56,7 @@ def test_a_drive_ends_at_a_collision_and_at_the_end_of_the_route():
 
 
 def test_a_drive_that_is_over_before_the_takeover_is_refused():
-    with pytest.raises(ValueError, match="seed 7 .* over before the takeover"):
+    with pytest.raises(ValueError, match=r"seed 7 .* over before the takeover"):
         run(road(wall_m=8.5), closed_loop.random_driver(), seed=7)
 
 

@@ -141,7 +141,7 @@ def test_losses():
 
 
 def test_geometry():
-    assert checked("p2", "p2_geometry.npz", geometry.GROUPS).passed == 26
+    assert checked("p2", "p2_geometry.npz", geometry.GROUPS).passed == 62
 
 
 def test_modules_of_the_1d_model():

@@ -175,16 +175,15 @@ def record(out: pathlib.Path, simulator: Simulator, jobs: Sequence[Job], setting
       CarlaError: where a sensor stalls, is blank or frozen, nothing is written, the disk is too small, or a drive
         fails ATTEMPTS times. The run in question stays incomplete and is recorded again next time.
     """
-    needed = estimate(out, jobs, settings)
     _describe(out, settings)
-    free = shutil.disk_usage(out).free
-    if needed.measured and needed.disk_bytes > free:
-        raise CarlaError(f"{out}: {needed.disk_bytes / 1e9:.1f} GB are needed, {free / 1e9:.1f} GB are free. Make room "
-                         f"or record fewer runs; what is complete is kept.")
-    done = needed.frames - needed.missing
     for job in jobs:
         if recorder.is_complete(out, job.split, job.run):
             continue
+        needed, free = estimate(out, jobs, settings), shutil.disk_usage(out).free
+        if needed.measured and needed.disk_bytes > free:
+            raise CarlaError(f"{out}: {needed.disk_bytes / 1e9:.1f} GB are needed, {free / 1e9:.1f} GB are free. Make "
+                             f"room or record fewer runs; what is complete is kept.")
+        done = needed.frames - needed.missing
         for attempt in range(ATTEMPTS):
             try:
                 for count in record_run(out, simulator, job._replace(seed=job.seed + attempt), settings):
@@ -194,7 +193,6 @@ def record(out: pathlib.Path, simulator: Simulator, jobs: Sequence[Job], setting
             except BadDriveError:
                 if attempt == ATTEMPTS - 1:
                     raise
-        done += job.frames
 
 
 def record_run(out: pathlib.Path, simulator: Simulator, job: Job, settings: Settings) -> Iterator[int]:

@@ -180,6 +180,14 @@ def test_a_run_that_writes_nothing_is_an_error(tmp_path, monkeypatch):
     assert not recorder.is_complete(tmp_path, JOB.split, JOB.run)
 
 
+def test_a_disk_that_is_too_small_is_told_after_the_first_run(tmp_path, monkeypatch):
+    monkeypatch.setattr(carla_recorder.shutil, "disk_usage", lambda path: types.SimpleNamespace(free=1000))
+    jobs, simulator = [JOB, JOB._replace(run="Town01_001")], FakeSimulator()
+    with pytest.raises(carla_recorder.CarlaError, match=r"GB are needed, 0\.0 GB are free"):
+        carla_recorder.record(tmp_path, simulator, jobs, SETTINGS)
+    assert len(simulator.started) == 1 and recorder.is_complete(tmp_path, JOB.split, JOB.run)
+
+
 def test_collect_awaits_the_frame_of_every_sensor():
     queues = {"image": queue.Queue(), "lidar": queue.Queue()}
     for frame in (6, 7):

@@ -15,7 +15,7 @@ import tyro
 
 from muvo_jax import command_line, dream, evaluate, presets
 from muvo_jax import config as config_lib
-from muvo_jax.training import loop, run_folder, screen, validation
+from muvo_jax.training import checkpoint, loop, run_folder, screen, validation
 from muvo_jax.viz import curves, sheets
 
 # Flags that change one field of the configuration.
@@ -64,6 +64,8 @@ class Options:
     """Where runs are kept."""
     resume: tyro.conf.FlagCreatePairsOff[bool] = False
     """Go on with the run of that name from its newest readable checkpoint, with the settings it was started with."""
+    init: Annotated[pathlib.Path | None, command_line.shown("RUN", "fresh weights")] = None
+    """Start from the weights of another run (trained, or converted from PyTorch), whose network is then taken too."""
     steps: Annotated[int | None, command_line.shown("N")] = None
     """Updates of the whole run. The learning rate follows a schedule over all of them."""
     batch: Annotated[int | None, command_line.shown("N")] = None
@@ -96,6 +98,7 @@ python -m muvo_jax.train --variant=PP-BEV-FC --no-occupancy
 python -m muvo_jax.train --preset=tiny  (does everything run?)
 python -m muvo_jax.train --data=/data/kitti_raw --name=kitti
 python -m muvo_jax.train --name=town-tr --resume --steps=800  (goes on with a run)
+python -m muvo_jax.train --init=runs/town-tr --data=/data/kitti_raw  (starts from its weights)
 python -m muvo_jax.train --preset=paper-occupancy --batch=1 --accumulate=1 --steps=1 --no-evaluate
 python -m muvo_jax.train --set loss.kl=0.01 model.dropout=0.0
 """
@@ -106,8 +109,10 @@ def configure(options: Options) -> tuple[config_lib.Config, dict[str, Any], path
 
     Raises:
       ValueError: for an unknown setting or a value of the wrong type; for another preset than that of the resumed run.
-      FileNotFoundError: where there is no run to resume.
+      FileNotFoundError, CheckpointError: where there is no run to resume or to start from.
     """
+    if options.resume and options.init:
+        raise ValueError("--resume and --init contradict each other: a resumed run has weights of its own.")
     chosen = {field: getattr(options, flag) for flag, field in _FIELDS.items() if getattr(options, flag) is not None}
     chosen = _variant_settings(options) | chosen | command_line.parse_settings(options.set)
     base = presets.get(options.preset or "town")
@@ -117,6 +122,8 @@ def configure(options: Options) -> tuple[config_lib.Config, dict[str, Any], path
         if options.preset not in (None, base.preset):
             raise ValueError(f"run {folder} was started with preset {base.preset!r}, not {options.preset!r}: leave "
                              f"--preset away, or start another run with --name.")
+    elif options.init:
+        base = dataclasses.replace(base, model=checkpoint.load_run(options.init).config.model)
     if options.occupancy or options.no_occupancy:
         chosen["model.heads"] = _heads(options, chosen.get("model.heads", base.model.heads))
     if chosen.get("model.fusion", "tr") != "tr" and base.model.latent == "2d":
@@ -175,7 +182,7 @@ def train(options: Options, show: screen.Screen) -> None:
     outcome = loop.train(loop.Job(
         config=config, folder=folder, open_recording=lambda: command_line.open_data(config, show), chosen=tuple(chosen),
         resume=options.resume, resume_command=resume_command, started_s=command_line.process_start_s(),
-        preview=draw_preview), show)
+        init=options.init, preview=draw_preview), show)
     draw_curves(folder)
     if outcome.stopped or not options.evaluate:
         return

@@ -1,6 +1,7 @@
 """Recordings in the MUVO / MILE CARLA layout, exactly as the authors' DataWriter and generate_voxels leave them.
 
     ROOT/trainval/<mode>/<Town>/<run>/pd_dataframe.pkl    one row a frame, paths relative to the run (carla_files.py)
+    ROOT/trainval/<mode>/<Town>/<run>/occupancy/*.npz     ours, optional: muvo_jax.voxelize separates empty and unknown
     ROOT/sensors.toml                                     ours, optional: [camera], [lidar], [voxels], [action], rate_hz
 
 The path may also be the version's folder (trainval), a mode's (train), a town's or a run's. Modes are the splits; where
@@ -30,6 +31,7 @@ from muvo_jax.ops import camera as camera_ops
 FRAME_FILE = "pd_dataframe.pkl"
 SENSORS_FILE = "sensors.toml"
 VERSION_FOLDER = "trainval"
+OCCUPANCY_FOLDER = "occupancy"
 RATE_HZ = 10.0
 MIN_MEAN_REWARD = 0.6
 SKIPPED_S = 1.0
@@ -126,15 +128,21 @@ class CarlaRecording:
         if not kept:
             raise schema.DataError(f"{path}: none of its {len(every)} runs has frames and a mean reward of "
                                    f"{min_mean_reward} or more. Record better ones.")
-        modalities = _modalities(kept)
+        self._is_carved = all((run.folder / OCCUPANCY_FOLDER).is_dir() for run in kept)
+        self._kinds = dict(_FILES)
+        if self._is_carved:
+            self._kinds["occupancy"] = OCCUPANCY_FOLDER
+            kept = [_with_occupancy(run) for run in kept]
+        modalities = _modalities(kept, self._kinds)
         self._runs = {run.name: run for run in kept}
         self._actions = {run.name: actions(run) for run in kept}
         self._speeds = {run.name: run.numbers("speed", 1)[:, 0] for run in kept}
         self._yaw_rates = {run.name: yaw_rates(run) for run in kept if "imu" in run.columns}
         self._rewards = {run.name: np.clip(run.numbers("reward", 1)[:, 0], -1.0, 1.0) for run in kept}
-        self.sequences = tuple(sequence for run in kept for sequence in _cut(run, modalities, skipped_s, rate_hz))
+        self.sequences = tuple(sequence for run in kept
+                               for sequence in _cut(run, modalities, self._kinds, skipped_s, rate_hz))
         present = {sequence.split for sequence in self.sequences}
-        notes = _notes(every, kept, min_mean_reward, modalities)
+        notes = _notes(every, kept, min_mean_reward, is_binary="occupancy" in modalities and not self._is_carved)
         self.description = schema.RecordingDescription(
             name=path.resolve().name, kind="MUVO CARLA", rate_hz=rate_hz, modalities=modalities,
             splits=tuple(sorted(present, key=lambda split: (split != "train", split))), notes=notes,
@@ -160,7 +168,7 @@ class CarlaRecording:
         }
         if run.name in self._yaw_rates:
             frame["yaw_rate_radps"] = self._yaw_rates[run.name][row]
-        paths = {key: run.path(kind, row) for key, kind in _FILES.items() if key in described.modalities}
+        paths = {key: run.path(kind, row) for key, kind in self._kinds.items() if key in described.modalities}
         if described.camera is not None and "image" in paths:
             camera = described.camera
             frame["image"] = files.read_image(paths["image"], "RGB")
@@ -173,7 +181,8 @@ class CarlaRecording:
         if described.lidar is not None and "points_m" in paths:
             frame["points_m"] = carla_files.read_points(paths["points_m"], described.lidar.position_m).points_m
         if described.voxels is not None and "occupancy" in paths:
-            frame["occupancy"] = carla_files.read_voxels(paths["occupancy"], described.voxels)
+            frame["occupancy"] = (_read_occupancy if self._is_carved else carla_files.read_voxels)(
+                paths["occupancy"], described.voxels)
         if "route_map" in paths:
             frame["route_map"] = _nearest(carla_files.read_route_map(paths["route_map"]), _ROUTE_PX)
         return frame
@@ -249,12 +258,30 @@ def _read_run(split: str, folder: pathlib.Path) -> Run:
     return run
 
 
-def _modalities(runs: list[Run]) -> frozenset[str]:
+def occupancy_name(row: int) -> str:
+    """Path of a frame's occupancy, relative to the run."""
+    return f"{OCCUPANCY_FOLDER}/{OCCUPANCY_FOLDER}_{row:09d}.npz"
+
+
+def _with_occupancy(run: Run) -> Run:
+    names = [occupancy_name(row) for row in range(run.frames)]
+    return dataclasses.replace(run, columns=run.columns | {f"{OCCUPANCY_FOLDER}_path": names})
+
+
+def _read_occupancy(path: pathlib.Path, grid: config_lib.VoxelGrid) -> np.ndarray:
+    occupancy = files.read_npz(path, "occupancy").astype(np.uint8, copy=False)
+    if occupancy.shape != grid.shape:
+        raise schema.DataError(f"{path}: a grid of {list(occupancy.shape)}, expected {list(grid.shape)}. Describe the "
+                               f"grid in {SENSORS_FILE}, or make the occupancy again.")
+    return occupancy
+
+
+def _modalities(runs: list[Run], kinds: dict[str, str]) -> frozenset[str]:
     """The keys of RawFrame that at least one run has files of; where another run lacks one, its frames are left out."""
     names = {"speed_mps", "action", "reward", "is_terminal", "timestamp_s", "frame_id"}
     if all("imu" in run.columns for run in runs):
         names.add("yaw_rate_radps")
-    names |= {key for key, kind in _FILES.items()
+    names |= {key for key, kind in kinds.items()
               if any(f"{kind}_path" in run.columns and run.path(kind, 0).parent.is_dir() for run in runs)}
     if "image" in names:
         names |= {"intrinsics", "camera_to_ego"}
@@ -284,21 +311,22 @@ def _nearest(picture: np.ndarray, side: int) -> np.ndarray:
     return np.ascontiguousarray(picture[rows[:, None], columns])
 
 
-def _notes(every: list[Run], kept: list[Run], min_mean_reward: float, modalities: frozenset[str]) -> tuple[str, ...]:
+def _notes(every: list[Run], kept: list[Run], min_mean_reward: float, *, is_binary: bool) -> tuple[str, ...]:
     notes = ["MUVO layout: an action is (throttle where pressed, else -brake; steering); pedals, not accelerations."]
     if len(kept) < len(every):
         notes.append(f"MUVO layout: {len(every) - len(kept)} of {len(every)} runs are left out, their mean reward is "
                      f"below {min_mean_reward}.")
-    if "occupancy" in modalities:
+    if is_binary:
         notes.append("MUVO layout: stored voxels say what is occupied; every other voxel counts as empty, seen or not.")
     return tuple(notes)
 
 
-def _cut(run: Run, modalities: frozenset[str], skipped_s: float, rate_hz: float) -> list[schema.Sequence]:
+def _cut(run: Run, modalities: frozenset[str], kinds: dict[str, str], skipped_s: float,
+         rate_hz: float) -> list[schema.Sequence]:
     """The gap-free sequences of a run after its first second; warns of gaps."""
     present = np.ones(run.frames, bool)
     absent = {}
-    for key, kind in _FILES.items():
+    for key, kind in kinds.items():
         if key not in modalities:
             continue
         if f"{kind}_path" not in run.columns:

@@ -31,6 +31,10 @@ BIRDVIEW_BITS = ("background", "road", "lane_marking", "vehicle", "pedestrian", 
 EGO_BOX_M = (2.451, 1.064, 1.511)
 UNLABELLED, PEDESTRIAN, ROAD_LINE, VEHICLE, SKY = 0, 4, 6, 10, 13  # CARLA up to 0.9.13
 UNKNOWN_TAG = 255
+# What CARLA's tags from 0.9.14 on (the index) are in the layout's tags, those of 0.9.13; the rest is unlabelled.
+LAYOUT_TAGS = np.zeros(256, np.uint8)
+LAYOUT_TAGS[:29] = (0, 7, 8, 1, 11, 2, 5, 18, 12, 9, 22, 13, 4, 4, 10, 10, 10, 10, 10, 10, 19, 20, 3, 21, 6, 14, 15, 16,
+                    17)
 
 
 class Points(NamedTuple):
@@ -109,11 +113,17 @@ def read_points(path: pathlib.Path, lidar_position_m: tuple[float, float, float]
         raise schema.DataError(f"{path}: ObjTag is no array of {len(points_m)} unsigned numbers.")
     finite = np.isfinite(points_m).all(axis=1)
     files.finite_points(points_m, path)
+    ego_m = to_ego_frame(points_m, lidar_position_m)
+    keep = finite & ~in_ego_box(ego_m)
+    return Points(ego_m[keep], None if tags is None else tags[keep].astype(np.uint8))
+
+
+def to_ego_frame(points_m: np.ndarray, lidar_position_m: tuple[float, float, float]) -> np.ndarray:
+    """CARLA's lidar frame (x forward, y right, z up) to the ego frame (y left), float32 [N, 3]."""
     x, y, z = (np.float32(value) for value in lidar_position_m)
     ego_m = points_m.astype(np.float32) + np.array([[x, -y, z]], np.float32)
     ego_m[:, 1] *= -1
-    keep = finite & ~in_ego_box(ego_m)
-    return Points(ego_m[keep], None if tags is None else tags[keep].astype(np.uint8))
+    return ego_m
 
 
 def in_ego_box(points_m: np.ndarray) -> np.ndarray:

@@ -32,10 +32,12 @@ _OPTIONAL_COLUMNS = ("reward", "is_terminal", "yaw_rad")
 
 
 @dataclasses.dataclass(frozen=True)
-class _Run:
+class Run:
+    """A complete run: its split, its folder and the columns of its frames.csv (name -> [F])."""
+
     split: str
     folder: pathlib.Path
-    columns: dict[str, np.ndarray]  # name -> [F]
+    columns: dict[str, np.ndarray]
 
 
 class PlainRecording:
@@ -50,15 +52,9 @@ class PlainRecording:
         """
         root = pathlib.Path(path)
         toml_path = root / DESCRIPTION_FILE
-        header = files.read_toml(toml_path)
-        if header.get("schema_version") != SCHEMA_VERSION:
-            raise schema.DataError(f"{toml_path}: schema_version is {header.get('schema_version')!r}, this reader "
-                                   f"knows {SCHEMA_VERSION}. Record it again, or use the muvo_jax that wrote it.")
+        header = read_header(root)
         splits = tuple(description.field(header, "splits", list, toml_path))
-        runs = [run for split in splits for run in _read_runs(root, split)]
-        if not runs:
-            raise schema.DataError(f"{root}: no complete run (a folder <split>/<run> with {FRAMES_FILE}) in the splits "
-                                   f"{', '.join(splits)}. The root holds {files.listing(root)}. Record it again.")
+        runs = read_runs(root, splits)
         rate_hz = description.rate_hz(header, toml_path)
         modalities = _modalities(runs)
         self._runs = {f"{run.split}/{run.folder.name}": run for run in runs}
@@ -123,14 +119,37 @@ def _check_shape(array: np.ndarray, expected: tuple[int, ...], path: pathlib.Pat
                                f"not mix recordings of different settings in one folder.")
 
 
-def _read_runs(root: pathlib.Path, split: str) -> list[_Run]:
+def read_header(root: pathlib.Path) -> dict:
+    """Returns recording.toml; raises DataError where it is missing, malformed or of another version."""
+    path = root / DESCRIPTION_FILE
+    header = files.read_toml(path)
+    if header.get("schema_version") != SCHEMA_VERSION:
+        raise schema.DataError(f"{path}: schema_version is {header.get('schema_version')!r}, this reader "
+                               f"knows {SCHEMA_VERSION}. Record it again, or use the muvo_jax that wrote it.")
+    return header
+
+
+def read_runs(root: pathlib.Path, splits: tuple[str, ...]) -> list[Run]:
+    """The complete runs of these splits, whatever files of theirs are there; incomplete ones are warned of.
+
+    Raises:
+      DataError: where there is none, or a frames.csv is malformed.
+    """
+    runs = [run for split in splits for run in _runs_of(root, split)]
+    if not runs:
+        raise schema.DataError(f"{root}: no complete run (a folder <split>/<run> with {FRAMES_FILE}) in the splits "
+                               f"{', '.join(splits)}. The root holds {files.listing(root)}. Record it again.")
+    return runs
+
+
+def _runs_of(root: pathlib.Path, split: str) -> list[Run]:
     """The complete runs of a split, in the order of their names; incomplete ones are left out with a warning."""
     folders = sorted(path for path in (root / split).glob("*") if path.is_dir())
     incomplete = [folder.name for folder in folders if not (folder / FRAMES_FILE).is_file()]
     if incomplete:
         warnings.warn(f"{root / split}: {len(incomplete)} of {len(folders)} runs have no {FRAMES_FILE}, are left out "
-                      f"as incomplete: {', '.join(incomplete[:6])}.", schema.DataWarning, stacklevel=3)
-    return [_Run(split, folder, _read_table(folder / FRAMES_FILE)) for folder in folders
+                      f"as incomplete: {', '.join(incomplete[:6])}.", schema.DataWarning, stacklevel=4)
+    return [Run(split, folder, _read_table(folder / FRAMES_FILE)) for folder in folders
             if (folder / FRAMES_FILE).is_file()]
 
 
@@ -173,7 +192,7 @@ def _number(path: pathlib.Path, line: int, name: str, text: str | None) -> float
     return value
 
 
-def _modalities(runs: list[_Run]) -> frozenset[str]:
+def _modalities(runs: list[Run]) -> frozenset[str]:
     """The keys of RawFrame that at least one run has; where another run lacks one, its frames are left out."""
     names = {"speed_mps", "action", "timestamp_s", "frame_id"}
     names |= {key for key, (folder, _) in _FILES.items() if any((run.folder / folder).is_dir() for run in runs)}
@@ -184,7 +203,7 @@ def _modalities(runs: list[_Run]) -> frozenset[str]:
     return frozenset(names)
 
 
-def _cut(run: _Run, name: str, modalities: frozenset[str], period_s: float) -> list[schema.Sequence]:
+def _cut(run: Run, name: str, modalities: frozenset[str], period_s: float) -> list[schema.Sequence]:
     """The gap-free sequences of a run (a terminal frame ends one); warns of gaps."""
     frame_ids = run.columns["frame_id"].astype(np.int64).tolist()
     absent = {}

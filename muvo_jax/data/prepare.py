@@ -79,7 +79,7 @@ def prepare_frame(raw: schema.RawFrame, config: config_lib.Config) -> PreparedFr
     except ValueError as error:
         raise schema.DataError(f"frame {int(raw['frame_id'])}: {error}") from error
     if model.lidar == "pp":
-        ready["points"], ready["point_count"] = _padded_points(raw["points_m"], model.pillars.points,
+        ready["points"], ready["point_count"] = padded_points(raw["points_m"], model.pillars.points,
                                                                int(raw["frame_id"]))
     ready["camera_to_ego"] = raw["camera_to_ego"]
     if model.navigation:
@@ -94,7 +94,7 @@ def prepare_frame(raw: schema.RawFrame, config: config_lib.Config) -> PreparedFr
     return ready
 
 
-def _padded_points(points_m: np.ndarray, rows: int, seed: int) -> tuple[np.ndarray, np.int32]:
+def padded_points(points_m: np.ndarray, rows: int, seed: int) -> tuple[np.ndarray, np.int32]:
     """Exactly `rows` points, zeros behind the last one, and how many are real.
 
     Of a longer scan a random subset stays, the same one each time: its first points would be one side of the world.

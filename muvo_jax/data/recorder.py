@@ -100,7 +100,7 @@ class RunWriter:
                 arrays = {name: np.asarray(frame[name], np.float32 if name == "points_m" else np.uint8)}
                 if name == "points_m" and "point_tags" in frame:
                     arrays["point_tags"] = np.asarray(frame["point_tags"], np.uint8)
-                self._path(folder, frame_id, ".npz").write_bytes(_npz(arrays))
+                self._path(folder, frame_id, ".npz").write_bytes(npz_bytes(arrays))
         self._rows.append([_cell(frame.get(name, "")) for name in COLUMNS])
 
     def close(self) -> None:
@@ -130,10 +130,10 @@ def decode_depth(pixels: np.ndarray) -> np.ndarray:
     return np.where(pixels == DEPTH_SKY, np.float32(np.inf), pixels.astype(np.float32) * np.float32(DEPTH_UNIT_M))
 
 
-def write_atomically(path: pathlib.Path, text: str) -> None:
-    """Writes a text file such that it is there whole or not at all."""
+def write_atomically(path: pathlib.Path, content: str | bytes) -> None:
+    """Writes a file such that it is there whole or not at all."""
     draft = path.with_name(f".{path.name}.{os.getpid()}")
-    draft.write_text(text, encoding="utf-8")
+    draft.write_bytes(content.encode() if isinstance(content, str) else content)
     os.replace(draft, path)
 
 
@@ -168,7 +168,7 @@ def _cell(value) -> str:
     return str(value) if isinstance(value, np.floating) else repr(float(value))
 
 
-def _npz(arrays: Mapping[str, np.ndarray]) -> bytes:
+def npz_bytes(arrays: Mapping[str, np.ndarray]) -> bytes:
     """An NPZ file, at the fastest compression: half the size of none, a third of the time of NumPy's.
 
     The archive's time stamps are fixed, so that equal arrays give equal bytes.

@@ -2,21 +2,14 @@
 
 from __future__ import annotations
 
-import contextlib
 import json
-import multiprocessing
 import os
 import pathlib
 from collections.abc import Callable, Iterator
 
 from array_record.python import array_record_module
 
-from muvo_jax.data import recorder, records, schema, sources
-
-try:
-    import fcntl
-except ImportError:  # Windows: there it is up to the user not to pack into one folder twice at once
-    fcntl = None  # type: ignore[assignment]
+from muvo_jax.data import processes, recorder, records, schema, sources
 
 PLAN_FILE = "plan.json"
 FRAMES_PER_SHARD = 256
@@ -52,7 +45,7 @@ def pack(source: pathlib.Path | str, out: pathlib.Path | str, *, encoding: recor
     recording = sources.open_recording(source)
     plan = _plan(recording, frames_per_shard, encoding)
     out.mkdir(parents=True, exist_ok=True)
-    with _locked(out, machine, machines):
+    with processes.locked(out / f".packing-{machine}-of-{machines}", "packing"):
         _keep_plan(out, plan)
         total = sum(sequence.length for sequence in recording.sequences)
         shards = -(-total // frames_per_shard)
@@ -61,7 +54,8 @@ def pack(source: pathlib.Path | str, out: pathlib.Path | str, *, encoding: recor
         missing = [number for number in mine if _entry(out, number) is None]
         done, wanted = sum(size(number) for number in mine if number not in missing), sum(map(size, mine))
         workers = min(os.cpu_count() or 1, len(missing)) if workers is None else min(workers, len(missing))
-        frames = (_in_processes(source, out, missing, frames_per_shard, encoding, workers) if workers > 1
+        shares = [(str(source), out, missing[first::workers], frames_per_shard, encoding) for first in range(workers)]
+        frames = (processes.stream(_write_share, shares, "packing") if workers > 1
                   else write_shards(recording, out, missing, frames_per_shard, encoding))
         for _ in frames:
             done += 1
@@ -132,58 +126,6 @@ def _entry(out: pathlib.Path, number: int) -> dict | None:
     return None if records.shard_fault(out, entry, checksum=False) else entry
 
 
-def _in_processes(source: pathlib.Path | str, out: pathlib.Path, missing: list[int], frames_per_shard: int,
-                  encoding: records.Encoding, workers: int) -> Iterator[int]:
-    context = multiprocessing.get_context("spawn")
-    receiver, sender = context.Pipe(duplex=False)
-    lock = context.Lock()
-    processes = [context.Process(target=_work, daemon=True, args=(
-        str(source), out, missing[first::workers], frames_per_shard, encoding, sender, lock, os.getpid()))
-        for first in range(workers)]
-    for process in processes:
-        process.start()
-    sender.close()  # then the end of the last worker ends the stream
-    try:
-        while True:
-            message = receiver.recv()
-            if isinstance(message, str):
-                raise RuntimeError(f"a packing process failed: {message}")
-            yield message
-    except EOFError:
-        pass
-    finally:
-        for process in processes:
-            if process.is_alive() and process.exitcode is None:
-                process.join(timeout=1.0)
-                process.terminate()
-            process.join()
-    codes = [process.exitcode for process in processes if process.exitcode]
-    if codes:
-        raise RuntimeError(f"{len(codes)} of {workers} packing processes ended with exit code {codes[0]}; run again, "
-                           f"complete shards are kept.")
-
-
-def _work(source: str, out: pathlib.Path, numbers: list[int], frames_per_shard: int, encoding: records.Encoding,
-          sender, lock, parent: int) -> None:
-    try:
-        for number in write_shards(sources.open_recording(source), out, numbers, frames_per_shard, encoding):
-            if os.getppid() != parent:  # killed: nobody would hold the lock for us
-                os._exit(1)
-            with lock:
-                sender.send(number)
-    except (ValueError, OSError) as error:
-        with lock:
-            sender.send(str(error))
-
-
-@contextlib.contextmanager
-def _locked(out: pathlib.Path, machine: int, machines: int) -> Iterator[None]:
-    """Keeps a second packer of the same shards out; the lock falls with the process, however it ends."""
-    with (out / f".packing-{machine}-of-{machines}").open("w") as file:
-        if fcntl is not None:
-            try:
-                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except BlockingIOError as error:
-                raise BlockingIOError(f"{out}: another process is packing here now; wait for it, or choose another "
-                                      f"folder.") from error
-        yield
+def _write_share(source: str, out: pathlib.Path, numbers: list[int], frames_per_shard: int,
+                 encoding: records.Encoding) -> Iterator[int]:
+    return write_shards(sources.open_recording(source), out, numbers, frames_per_shard, encoding)

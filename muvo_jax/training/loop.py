@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import concurrent.futures
 import dataclasses
+import functools
 import math
 import pathlib
 import time
@@ -18,6 +19,7 @@ from muvo_jax import config as config_lib
 from muvo_jax import types
 from muvo_jax.data import pipeline, prepare, schema
 from muvo_jax.training import checkpoint, first_guess, host, integrity, preparation, run_folder, screen, validation
+from muvo_jax.training import state as state_lib
 
 Preview = Callable[[pathlib.Path, validation.Validator, types.Variables, str], None]
 
@@ -36,6 +38,7 @@ class Job:
       open_recording: opens (or first makes) the data; called once.
       chosen: dotted names that the user set, which fitting the config to the data leaves alone.
       resume: go on with the run in `folder` instead of starting one.
+      init: a run whose newest readable weights a new run starts from.
       resume_command: what to type to go on, for messages.
       started_s: time.perf_counter() at the start of the command.
       preview: draws pictures at `train.preview_every`.
@@ -46,6 +49,7 @@ class Job:
     open_recording: Callable[[], schema.Recording]
     chosen: Collection[str] = ()
     resume: bool = False
+    init: pathlib.Path | None = None
     resume_command: str = "python -m muvo_jax.train --resume"
     started_s: float = dataclasses.field(default_factory=time.perf_counter)
     preview: Preview | None = None
@@ -83,12 +87,13 @@ def train(job: Job, show: screen.Screen) -> Outcome:
         ready = early.result()
         ready = preparation.recompile(ready, config, shapes) if ready else preparation.prepare(config, shapes)
     _introduce(job, show, config, ready, source.windows_per_epoch)
+    first = functools.partial(_first_state, job, show, config, ready, frames)
+    state, done, data_state = (None if job.resume else first()), 0, None
     if not job.resume:
         run_folder.create(job.folder, config, job.resume_command)
     keeper = checkpoint.Checkpoints(job.folder, keep_last=config.train.keep_last, keep_best=config.train.keep_best)
-    state, done, data_state = _resume(job, show, keeper, config, ready) if job.resume else (ready.state, 0, None)
-    if not done and config.model.first_guess == "training_mean":
-        state = first_guess.fill(state, validation.training_sums(frames), config.model, ready.step.plan)
+    if job.resume:
+        state, done, data_state = _resume(job, show, keeper, config, ready, first)
     if data_state is not None:
         source = pipeline.train_batches(frames, seed=config.train.seed, batch=windows_per_step(config),
                                         start_state=data_state)
@@ -152,12 +157,12 @@ def _introduce(job: Job, show: screen.Screen, config: config_lib.Config, ready: 
 
 
 def _resume(job: Job, show: screen.Screen, keeper: checkpoint.Checkpoints, config: config_lib.Config,
-            ready: preparation.Prepared):
+            ready: preparation.Prepared, first: Callable[[], state_lib.TrainState]):
     restored = keeper.restore_latest(ready.state, config)
     if restored is None:
         show.warn(f"{job.folder} has no checkpoint yet: training starts at step 0.")
         run_folder.forget_after(job.folder, 0)
-        return ready.state, 0, None
+        return first(), 0, None
     for text in restored.warnings:
         show.warn(text)
     later = [step for step in keeper.steps() if step > restored.step]
@@ -168,6 +173,35 @@ def _resume(job: Job, show: screen.Screen, keeper: checkpoint.Checkpoints, confi
     run_folder.forget_after(job.folder, restored.step)
     show.field("resumed", f"from step {restored.step}")
     return restored.state, restored.step, restored.data_state
+
+
+def _first_state(job: Job, show: screen.Screen, config: config_lib.Config, ready: preparation.Prepared,
+                 frames: pipeline.Frames) -> state_lib.TrainState:
+    """The state of step 0: weights of another run, or fresh ones."""
+    if job.init:
+        return _from_run(job.init, show, config, ready)
+    if config.model.first_guess == "training_mean":
+        return first_guess.fill(ready.state, validation.training_sums(frames), config.model, ready.step.plan)
+    return ready.state
+
+
+def _from_run(run: pathlib.Path, show: screen.Screen, config: config_lib.Config,
+              ready: preparation.Prepared) -> state_lib.TrainState:
+    """A state at step 0 with the weights of another run.
+
+    Raises:
+      CheckpointError: where it has none that can be read.
+      ValueError: where they belong to another network.
+    """
+    loaded = checkpoint.load_run(run)
+    for text in loaded.warnings:
+        show.warn(text)
+    shapes = lambda tree: jax.tree.map(lambda leaf: leaf.shape, tree)
+    numerics = (config.model.numerics, loaded.config.model.numerics)
+    if numerics[0] != numerics[1] or shapes(dict(loaded.variables)) != shapes(ready.state.variables):
+        checkpoint.check_architecture(config, loaded.config, str(run))
+    show.field("weights", f"of step {loaded.step} of {run}")
+    return ready.with_variables(loaded.variables, config)
 
 
 class _Run:

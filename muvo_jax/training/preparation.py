@@ -46,6 +46,13 @@ class Prepared:
         return sum(leaf.size for leaf in jax.tree.leaves(self.state.params))
 
 
+    def with_variables(self, variables: types.Variables, config: config_lib.Config) -> state_lib.TrainState:
+        """`state` with other variables of the same shapes and a fresh optimiser."""
+        optimizer = optimizer_lib.make_optimizer(config.optimizer, config.train.steps)
+        state = state_lib.create(variables, optimizer, self.state.key)
+        return parallel_lib.place_state(self.step.plan, state)
+
+
 def expected_batch(config: config_lib.Config, windows: int, *, rewards: bool = True) -> types.Batch:
     """The shapes of a batch of `windows` training windows, as jax.ShapeDtypeStruct leaves.
 

@@ -143,7 +143,7 @@ def test_folders_that_are_no_recording(tmp_path):
     with pytest.raises(schema.DataError, match="is empty"):
         sources.open_recording(tmp_path)
     (tmp_path / "holiday.jpg").touch()
-    with pytest.raises(schema.DataError, match=r"no known kind. Known are plain .*KITTI raw .*Found holiday.jpg"):
+    with pytest.raises(schema.DataError, match=r"no known kind. Known are .*plain .*KITTI raw .*Found holiday.jpg"):
         sources.open_recording(tmp_path)
     with pytest.raises(schema.DataError, match="is a file"):
         sources.open_recording(tmp_path / "holiday.jpg")

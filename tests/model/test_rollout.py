@@ -145,6 +145,10 @@ def test_one_compilation_for_equal_shapes(variables, state, actions):
 
 def test_training_windows_use_dropout_and_update_statistics(variables):
     batch, keys = make_batch(), jax.random.split(jax.random.key(4), BATCH)
+    # A fresh fusion transformer hands its tokens through: its dropouts show once it was trained.
+    random = np.random.default_rng(0)
+    move = lambda leaf: leaf + 0.1 * random.normal(size=leaf.shape).astype(np.float32)
+    variables = {**variables, "params": jax.tree.map(move, variables["params"])}
     window = jax.jit(rollout.observe_window, static_argnums=0, static_argnames=("train", "sampled"))
     first, stats = window(MODEL, variables, batch, keys, train=True, sampled=False)
     again, _ = window(MODEL, variables, batch, keys, train=True, sampled=False)

@@ -215,6 +215,25 @@ def test_resuming_with_another_architecture_names_both(uninterrupted):
         _train(uninterrupted[0], config=config, resume=True)
 
 
+def test_a_new_run_starts_from_the_weights_of_another(tmp_path, uninterrupted):
+    folder, _, final, _ = uninterrupted
+    show = Interrupting()
+    _train(tmp_path / "more", show, config=_config(steps=1, validate_every=0), init=folder)
+    assert f"of step {STEPS} of {folder}" in show.output.getvalue()
+    # One update at the schedule's first, tiny rate leaves the parameters where they were.
+    moved = jax.tree.map(lambda a, b: np.abs(a - b).max(), _final(tmp_path / "more")["params"], final["params"])
+    assert 0 < max(jax.tree.leaves(moved)) < 1e-3
+    assert checkpoint.load_run(tmp_path / "more").step == 1
+
+
+def test_weights_of_another_network_are_refused_naming_both(tmp_path, uninterrupted):
+    config = _config()
+    wider = dataclasses.replace(config, model=dataclasses.replace(config.model, deterministic_channels=32))
+    with pytest.raises(ValueError, match=r"deterministic_channels 16 \(stored\) against 32 \(asked for\)"):
+        _train(tmp_path / "other", config=wider, init=uninterrupted[0])
+    assert not (tmp_path / "other").exists()
+
+
 def test_a_loss_that_is_not_finite_stops_the_run_by_name(tmp_path):
     config = config_lib.override(_config(), "optimizer.learning_rate", 1e38)
     with pytest.raises(loop.NonFiniteLossError, match=r"step \d: the loss is not finite: .*= (nan|inf).*checkpoint"):

@@ -26,6 +26,7 @@ EGO_RADIUS_M = 1.0
 LOST_M = 4.0
 WEATHER_NAMES = tuple(settings.WEATHERS)
 ROUTE_STEP_M = 1.0
+ROUTE_END_POINTS = 40  # of the route are left when a drive is over: sensors still see it go on
 
 
 @flax.struct.dataclass
@@ -150,7 +151,7 @@ class Town:
     def is_terminal(self, state: TownState) -> bool:
         """Whether the drive is over: a collision, off the route, or at its end."""
         return bool(state.collided) or self._deviation(state)[0] > LOST_M or int(state.progress) >= (
-            len(state.route_m) - 40)
+            len(state.route_m) - ROUTE_END_POINTS)
 
     def render(self, state: TownState) -> dict[str, Any]:
         """What the sensors measure; see renderer.Renderer.render for the images and points.

@@ -1,0 +1,253 @@
+"""Driving a simulator closed loop: observe, filter, plan in imagination, apply the first action, again.
+
+The simulator comes as functions, so that any one will do; a driver is a function of what it remembers and of the
+simulator's state. `planning_driver` makes one of a world model; the others are what it is measured against.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import flax.struct
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from muvo_jax.agents import environment as environment_lib
+from muvo_jax.agents import kinematics, planners
+from muvo_jax.model import live
+from muvo_jax.types import Array, ArrayLike, LatentState, Variables
+
+
+@dataclasses.dataclass(frozen=True)
+class Situation:
+    """Where a drive stands.
+
+    Attributes:
+      progress_m: metres along the route.
+      collided: whether the car touches something.
+      lost: whether it left its route.
+      arrived: whether the route is at its end.
+    """
+
+    progress_m: float
+    collided: bool = False
+    lost: bool = False
+    arrived: bool = False
+
+    @property
+    def over(self) -> bool:
+        return self.collided or self.lost or self.arrived
+
+
+@dataclasses.dataclass(frozen=True)
+class Simulator:
+    """What the loop needs of a simulator; all functions are pure in its state.
+
+    Attributes:
+      reset: seed -> state.
+      step: (state, action [2]) -> state, one step of the world model later.
+      observe: state -> field of types.Batch -> array without batch and time axis.
+      situation: state -> Situation.
+      expert: state -> action [2]; drives until a driver takes over, and is a baseline.
+      step_s: seconds of one step.
+    """
+
+    reset: Callable[[int], Any]
+    step: Callable[[Any, np.ndarray], Any]
+    observe: Callable[[Any], Mapping[str, ArrayLike]]
+    situation: Callable[[Any], Situation]
+    expert: Callable[[Any], np.ndarray]
+    step_s: float
+
+
+# (key, memory, state, previous action) -> (memory, action); memory is None at first.
+Driver = Callable[[Array, Any, Any, np.ndarray], tuple[Any, np.ndarray]]
+
+
+@flax.struct.dataclass
+class PlanMemory:
+    """What the planning driver remembers.
+
+    Attributes:
+      live: the filter's state, of a batch of one.
+      plan: float32 [H, 2]; its first action was applied.
+      value: the return expected of it.
+    """
+
+    live: live.LiveState
+    plan: Array
+    value: Array
+
+
+@dataclasses.dataclass(frozen=True)
+class Moment:
+    """One step of a drive: the state, the action applied in it, and what the driver remembered then."""
+
+    state: Any
+    action: np.ndarray
+    memory: Any
+
+
+@dataclasses.dataclass(frozen=True)
+class Drive:
+    """A drive from the moment at which its driver took over.
+
+    Attributes:
+      progress_m: metres along the route until the end, or until the collision or the loss of the route.
+      steps: that were driven.
+      end: the Situation at the end.
+      moments: its steps.
+    """
+
+    progress_m: float
+    steps: int
+    end: Situation
+    moments: tuple[Moment, ...]
+
+    @property
+    def unharmed(self) -> bool:
+        """Whether it ended by time or arrival."""
+        return not (self.end.collided or self.end.lost)
+
+
+def drive(simulator: Simulator, driver: Driver, key: Array, seed: int, steps: int, *, context: int = 0) -> Drive:
+    """One drive.
+
+    Args:
+      simulator, driver: who drives what.
+      key: of the driver; step t uses fold_in(key, t).
+      seed: of the simulator.
+      steps: to drive at most, from the takeover on.
+      context: steps before it, in which the expert drives and the driver watches: it is called, its action is not used.
+
+    Raises:
+      ValueError: if steps is below 1 or context negative, or the drive is over before the takeover.
+    """
+    if steps < 1 or context < 0:
+        raise ValueError(f"drive: got steps={steps} and context={context}; expected at least 1 and 0.")
+    state, memory, previous = simulator.reset(seed), None, np.zeros(2, np.float32)
+    for step in range(context):
+        memory, _ = driver(jax.random.fold_in(key, step), memory, state, previous)
+        previous = np.asarray(simulator.expert(state), np.float32)
+        state = simulator.step(state, previous)
+    now = start = simulator.situation(state)
+    if start.over:
+        raise ValueError(f"drive: with seed {seed} the expert's drive was over before the takeover: {start}.")
+    moments: list[Moment] = []
+    while len(moments) < steps and not now.over:
+        key_step = jax.random.fold_in(key, context + len(moments))
+        memory, previous = driver(key_step, memory, state, previous)
+        moments.append(Moment(state, previous, memory))
+        state = simulator.step(state, previous)
+        now = simulator.situation(state)
+    return Drive(now.progress_m - start.progress_m, len(moments), now, tuple(moments))
+
+
+def planning_driver(simulator: Simulator, environment: environment_lib.Environment, variables: Variables,
+                    planner: str = "cem", config: planners.PlannerConfig = planners.PlannerConfig(), *,
+                    horizon: int = 10, temperature: float = 0.0, discount: float = 0.98) -> Driver:
+    """Drives by planning in imagination at every step, from the last plan shifted; compiled once.
+
+    Args:
+      simulator: only its `observe` is used; it must give speed_mps and, for progress along the route, route_map.
+      environment: model, rewards and contract.
+      variables: of the model.
+      planner: name in planners.PLANNERS.
+      horizon: steps to plan.
+      temperature: factor on the latent noise in imagination; 0 plans on the mean future.
+      discount: of the planned return.
+
+    Raises:
+      ValueError: for an unknown planner, a horizon below 1, or a simulator that steps at another rate than the model.
+    """
+    if planner not in planners.PLANNERS:
+        raise ValueError(f"planner {planner!r} is unknown; known are {', '.join(planners.PLANNERS)}.")
+    if horizon < 1:
+        raise ValueError(f"planning_driver: horizon is {horizon}; it must be at least 1.")
+    if abs(simulator.step_s - environment.step_s) > 1e-6:
+        raise ValueError(f"planning_driver: the simulator steps {simulator.step_s} s, the model "
+                         f"{environment.step_s} s.")
+
+    def driver(key, memory, state, previous):
+        key_filter, key_plan = jax.random.split(key)
+        if memory is None:
+            memory = PlanMemory(live.start_live(environment.model, key_filter), jnp.zeros((horizon, 2)),
+                                jnp.float32(0))
+        observation = {name: np.asarray(value)[None] for name, value in simulator.observe(state).items()}
+        memory = plan_step(environment, planner, config, variables, key_plan, memory, observation, previous[None],
+                           jnp.float32(temperature), discount)
+        return memory, np.asarray(memory.plan[0])
+
+    return driver
+
+
+@functools.partial(jax.jit, static_argnames=("environment", "planner", "config", "discount"))
+def plan_step(environment: environment_lib.Environment, planner: str, config: planners.PlannerConfig,
+              variables: Variables, key: Array, memory: PlanMemory, observation: Mapping[str, Array],
+              previous_action: Array, temperature: Array, discount: float) -> PlanMemory:
+    """Filters one observation (each field [1, ...]) and plans from there on. The latents are means, not samples."""
+    filtered = live.observe_step(environment.model, variables, memory.live, observation, previous_action,
+                                 sampled=False)
+    speed_mps, route_map = observation["speed_mps"], observation.get("route_map")
+    bank = environment_lib.StartBank(filtered.latent, speed_mps, route_map)
+    horizon = memory.plan.shape[0]
+    params = dataclasses.replace(environment.params(variables, bank, horizon), temperature=temperature)
+    state = environment_lib.EnvState(filtered.latent[0], kinematics.at_rest_of_frame(speed_mps[0]), jnp.int32(0),
+                                     jnp.int32(0), jnp.float32(0), jnp.bool_(False))
+    objective = planners.imagined_returns(environment, params, state, discount=discount)
+    plan = planners.PLANNERS[planner](objective, key, planners.shift(memory.plan), config)
+    return PlanMemory(filtered, plan.actions, plan.value)
+
+
+def latents(moments: Sequence[Moment]) -> tuple[LatentState, Array]:
+    """The filtered latents [T, ...] and plans [T, H, 2] of a planned drive."""
+    stack = lambda *leaves: jnp.concatenate(leaves)
+    states = jax.tree.map(stack, *(moment.memory.live.latent for moment in moments))
+    return states, jnp.stack([moment.memory.plan for moment in moments])
+
+
+def expert_driver(simulator: Simulator) -> Driver:
+    """The simulator's own expert, deciding at the model's rate."""
+    return lambda key, memory, state, previous: (memory, np.asarray(simulator.expert(state), np.float32))
+
+
+def constant_driver(action: Sequence[float]) -> Driver:
+    """Always the same action."""
+    fixed = np.asarray(action, np.float32)
+    return lambda key, memory, state, previous: (memory, fixed)
+
+
+def random_driver() -> Driver:
+    """A uniform action in [-1, 1] at every step."""
+    return lambda key, memory, state, previous: (memory, np.asarray(jax.random.uniform(key, (2,), minval=-1.0)))
+
+
+def summarise(drives: Mapping[str, Sequence[Drive]], expert: str, route_m: float) -> dict[str, dict[str, float]]:
+    """Scores of each driver over drives of the same seeds.
+
+    Args:
+      drives: driver -> its drives, in the order of the seeds.
+      expert: the driver against whose metres progress is measured.
+      route_m: length of a route.
+
+    Returns:
+      driver -> {"success": share of drives without collision or loss of the route, "route_share": mean share of the
+      route driven until then, "collisions", "lost": counts, "progress_m": mean metres, "progress": metres of all drives
+      over the expert's (nan where it stood still), "seconds_share": steps driven over the expert's, "drives": count}.
+    """
+    expert_m = sum(one.progress_m for one in drives[expert])
+    expert_steps = sum(one.steps for one in drives[expert])
+    scores = {}
+    for name, runs in drives.items():
+        metres = sum(one.progress_m for one in runs)
+        scores[name] = {
+            "drives": len(runs), "success": float(np.mean([one.unharmed for one in runs])),
+            "route_share": metres / len(runs) / route_m, "collisions": sum(one.end.collided for one in runs),
+            "lost": sum(one.end.lost for one in runs), "progress_m": metres / len(runs),
+            "progress": metres / expert_m if expert_m > 0 else float("nan"),
+            "seconds_share": sum(one.steps for one in runs) / expert_steps}
+    return scores

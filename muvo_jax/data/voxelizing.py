@@ -1,0 +1,330 @@
+"""Makes the occupancy of recordings from depth maps and lidar scans, frame by frame and in parallel.
+
+Rule "carved" (ours): what a ray hit is occupied, what rays of lidar and camera passed through is empty, the rest is
+unknown. Rule "reference": what is hit is occupied and all else counts as empty, in the MUVO layout point for point
+and label for label as the authors' generate_voxels.
+
+    plain format, both rules    <run>/occupancy/000012.npz
+    MUVO layout, carved         <run>/occupancy/occupancy_000000012.npz; their code does not look there, ours does
+    MUVO layout, reference      <run>/voxel/voxel_000000012.npy, and the column voxel_path in pd_dataframe.pkl
+
+rule.json beside the files says how they were made; files of two rules or grids are never mixed.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import io
+import json
+import math
+import os
+import pathlib
+import shutil
+import zipfile
+from collections.abc import Callable, Iterator
+from typing import NamedTuple
+
+import numpy as np
+
+from muvo_jax import config as config_lib
+from muvo_jax.data import (
+    carla,
+    carla_files,
+    description,
+    files,
+    frame_pickle,
+    plain,
+    processes,
+    recorder,
+    safe_pickle,
+    schema,
+)
+from muvo_jax.ops import camera as camera_ops
+from muvo_jax.ops import voxels as voxel_ops
+
+RULES = ("carved", "reference")
+RULE_FILE = "rule.json"
+ORIGINAL_FRAME_FILE = "pd_dataframe.before_voxels.pkl"
+_LOCK_FILE = ".voxelizing"
+_CHUNK = 4  # frames between two reports of progress
+_LEVEL = ((0, 0, 1), (-1, 0, 0), (0, -1, 0))
+
+
+class Frame(NamedTuple):
+    """The files of one frame: two to read, one to write."""
+
+    depth: pathlib.Path
+    points: pathlib.Path
+    target: pathlib.Path
+
+
+class Rig(NamedTuple):
+    """What holds for all frames; `camera` is None for the authors' in the MUVO layout, whatever the image's size."""
+
+    is_muvo: bool
+    rule: str
+    camera: schema.Camera | None
+    lidar_position_m: tuple[float, float, float]
+    grid: config_lib.VoxelGrid
+
+
+class Result(NamedTuple):
+    """How many frames were made, and how many were there and are kept."""
+
+    made: int
+    kept: int
+
+
+def voxelize(path: pathlib.Path | str, *, rule: str = "carved", overwrite: bool = False, workers: int | None = None,
+             progress: Callable[[int, int], None] | None = None) -> Result:
+    """Makes what is missing of the occupancy of a recording; whole files that are there are kept.
+
+    Args:
+      path: a plain recording, or any folder of the MUVO layout (all its runs and frames, as in the authors' tool).
+      rule: one of RULES.
+      overwrite: makes everything anew.
+      workers: processes, by default one for each processor.
+      progress: called with (frames done, frames in all).
+
+    Raises:
+      DataError: for a path of another kind, without depth or lidar, without a described grid; or, when all other
+        frames are done, for frames that cannot be made.
+      FileExistsError: where files of another rule or grid are there.
+      BlockingIOError: where another process works on `path`.
+      RuntimeError: where a worker was killed.
+    """
+    path = pathlib.Path(path)
+    if rule not in RULES or (workers is not None and workers < 1):
+        raise ValueError(f"rule {rule!r}, {workers} workers: expected one of {', '.join(RULES)}, at least one worker.")
+    rig, runs = _survey(path, rule)
+    frames = [frame for run in runs.values() for frame in run]
+    with processes.locked(path / _LOCK_FILE, "voxelizing"):
+        rule_text = json.dumps({"rule": rule} | dataclasses.asdict(rig.grid)) + "\n"
+        for folder in {frame.target.parent for frame in frames}:
+            _clear(folder, rule_text, overwrite)
+        missing = [frame for frame in frames if not is_whole(frame.target)]
+        for folder in {frame.target.parent for frame in missing}:
+            folder.mkdir(exist_ok=True)
+            recorder.write_atomically(folder / RULE_FILE, rule_text)
+        kept = len(frames) - len(missing)
+        workers = min(workers or os.cpu_count() or 1, math.ceil(len(missing) / _CHUNK))
+        shares = [(rig, missing[first::workers]) for first in range(workers)]
+        made = processes.stream(make_frames, shares, "voxelizing") if workers > 1 else make_frames(rig, missing)
+        faults: list[str] = []
+        for done, fault in enumerate(made, start=1):
+            faults += [fault] if fault else []
+            if progress is not None and (done % _CHUNK == 0 or done == len(missing)):
+                progress(kept + done, len(frames))
+        if rig.is_muvo and rule == "reference":
+            for folder, run in runs.items():
+                if all(frame.target.is_file() for frame in run):
+                    _add_column(folder, run)
+    if faults:
+        raise schema.DataError(f"{path}: {len(faults)} of {len(frames)} frames have no occupancy, the others are done. "
+                               f"{' '.join(faults[:3])}{' ...' * (len(faults) > 3)}")
+    return Result(made=len(missing), kept=kept)
+
+
+def make_frames(rig: Rig, frames: list[Frame]) -> Iterator[str]:
+    """Makes frames; yields after each what was wrong with it, or an empty string."""
+    for frame in frames:
+        try:
+            recorder.write_atomically(frame.target, _content(rig, frame))
+        except schema.DataError as error:
+            yield str(error)
+        else:
+            yield ""
+
+
+def is_whole(path: pathlib.Path) -> bool:
+    """Whether an .npz or .npy file is there and complete, without reading all of it."""
+    if not path.is_file():
+        return False
+    if path.suffix == ".npz":
+        return zipfile.is_zipfile(path)
+    with path.open("rb") as file:
+        try:
+            np.lib.format.read_magic(file)
+            shape, _, dtype = np.lib.format.read_array_header_1_0(file)
+        except (ValueError, EOFError):
+            return False
+        return not dtype.hasobject and path.stat().st_size == file.tell() + math.prod(shape) * dtype.itemsize
+
+
+def carved_occupancy(depth_m: np.ndarray, points_m: np.ndarray, intrinsics: np.ndarray, camera_to_ego: np.ndarray,
+                     lidar_position_m: tuple[float, float, float], grid: config_lib.VoxelGrid, *,
+                     keep: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
+    """The occupancy of one frame.
+
+    Every pixel and every point occupies. Of the pixels, only so many carve that their rays, at the far end of the grid,
+    lie at most a voxel apart.
+
+    Args:
+      depth_m: [H, W], along the optical axis; infinite in the sky (such a ray carves to the grid's border), NaN or not
+        positive where nothing was measured.
+      points_m: float32 [P, 3], ego frame, of the lidar.
+      intrinsics, camera_to_ego: [3, 3] and [4, 4].
+      keep: leaves out points [Q, 3] that count for nothing, such as the recording car's own.
+
+    Returns:
+      uint8 [X, Y, Z]: 1 occupied, 0 empty, 255 unknown.
+    """
+    camera_m = camera_to_ego[:3, 3]
+    corners_m = np.array([grid.origin_m, np.add(grid.origin_m, np.multiply(grid.shape, grid.voxel_size_m))])
+    reach_m = float(np.linalg.norm(np.abs(corners_m - camera_m).max(axis=0)))  # every voxel is nearer to the camera
+    stride = max(1, int(grid.voxel_size_m * min(intrinsics[0, 0], intrinsics[1, 1]) / reach_m))
+    thinned_m = np.full_like(depth_m, np.nan)
+    chosen = np.s_[stride // 2::stride, stride // 2::stride]
+    thinned_m[chosen] = np.where(np.isposinf(depth_m[chosen]), reach_m, depth_m[chosen])
+    ends_m = keep(camera_ops.depth_to_points(thinned_m, intrinsics, camera_to_ego))
+    seen_m = keep(camera_ops.depth_to_points(depth_m, intrinsics, camera_to_ego))
+    occupied = voxel_ops.voxelize(np.concatenate([seen_m, points_m]), grid) == voxel_ops.OCCUPIED
+    empty = voxel_ops.carve(camera_m, ends_m, grid) | voxel_ops.carve(np.array(lidar_position_m), points_m, grid)
+    return np.where(occupied, voxel_ops.OCCUPIED, np.where(empty, voxel_ops.EMPTY, voxel_ops.UNKNOWN)).astype(np.uint8)
+
+
+def _survey(path: pathlib.Path, rule: str) -> tuple[Rig, dict[pathlib.Path, list[Frame]]]:
+    """What is measured with, and the frames of every run by its folder; checks that there is depth and lidar."""
+    if (path / plain.DESCRIPTION_FILE).is_file():
+        rig, runs = _survey_plain(path, rule)
+    elif path.is_dir() and carla.folders(path):
+        rig, runs = _survey_muvo(path, rule)
+    else:
+        raise schema.DataError(f"{path} is no recording whose occupancy can be made; expected a plain one (a folder "
+                               f"with {plain.DESCRIPTION_FILE}) or runs of the MUVO layout (with {carla.FRAME_FILE}).")
+    for folder, frames in runs.items():
+        for what, places in (("depth map", {frame.depth for frame in frames}),
+                             ("lidar scan", {frame.points for frame in frames})):
+            if places and not any(place.is_file() for place in places):
+                raise schema.DataError(f"{folder}: no frame has a {what} (such as {min(places)}); occupancy is made "
+                                       f"from both. Record them, or train without: then the target is made from each "
+                                       f"scan alone.")
+    return rig, runs
+
+
+def _survey_plain(path: pathlib.Path, rule: str) -> tuple[Rig, dict[pathlib.Path, list[Frame]]]:
+    toml_path = path / plain.DESCRIPTION_FILE
+    header = plain.read_header(path)
+    if "voxels" not in header:
+        raise schema.DataError(f"{toml_path}: no section [voxels], the grid to fill; add one, such as [voxels] shape = "
+                               f"[192, 192, 64], voxel_size_m = 0.5, origin_m = [-48.0, -48.0, -6.0].")
+    camera, lidar, grid = (description.section(header, name, toml_path, required=True)
+                           for name in ("camera", "lidar", "voxels"))
+    runs = {}
+    for run in plain.read_runs(path, tuple(description.field(header, "splits", list, toml_path))):
+        names = [f"{int(number):06d}" for number in run.columns["frame_id"]]
+        runs[run.folder] = [Frame(run.folder / "depth" / f"{name}.png", run.folder / "lidar" / f"{name}.npz",
+                                  run.folder / "occupancy" / f"{name}.npz") for name in names]
+    return Rig(False, rule, camera, lidar.position_m, grid), runs
+
+
+def _survey_muvo(path: pathlib.Path, rule: str) -> tuple[Rig, dict[pathlib.Path, list[Frame]]]:
+    toml_path = path / carla.SENSORS_FILE
+    header = files.read_toml(toml_path) if toml_path.is_file() else {}
+    camera, lidar, grid = (description.section(header, name, toml_path, required=False)
+                           for name in ("camera", "lidar", "voxels"))
+    runs = {}
+    for run in carla.find_runs(path):
+        lacking = [kind for kind in ("depth_semantic", "points_semantic") if f"{kind}_path" not in run.columns]
+        if lacking:
+            raise schema.DataError(f"{run.folder / carla.FRAME_FILE}: no column {lacking[0]}_path; occupancy is made "
+                                   f"from depth and lidar. Record both.")
+        name = carla.occupancy_name if rule == "carved" else lambda row: carla_files.file_name("voxel", row)
+        runs[run.folder] = [Frame(run.path("depth_semantic", row), run.path("points_semantic", row),
+                                  run.folder / name(row)) for row in range(run.frames)]
+    return Rig(True, rule, camera, (lidar or carla.LIDAR).position_m, grid or carla.VOXELS), runs
+
+
+def _clear(folder: pathlib.Path, rule_text: str, overwrite: bool) -> None:
+    """Removes what an interrupted write left in a folder of results, and all results where that is wanted."""
+    path = folder / RULE_FILE
+    if overwrite:
+        for old in folder.glob("*.np[yz]"):
+            old.unlink()
+    elif path.is_file() and path.read_text(encoding="utf-8") != rule_text:
+        raise FileExistsError(f"{path}: the files there were made by {path.read_text(encoding='utf-8').strip()}, not "
+                              f"by {rule_text.strip()}. --overwrite removes them and makes all anew.")
+    for draft in folder.glob(".*.np[yz].*"):
+        draft.unlink()
+
+
+def _content(rig: Rig, frame: Frame) -> bytes:
+    """The bytes of the frame's new file."""
+    if rig.is_muvo:
+        depth, tags = carla_files.read_depth_semantic(frame.depth)
+        scan = carla_files.read_points(frame.points, rig.lidar_position_m)
+        if rig.rule == "reference":
+            file = io.BytesIO()
+            np.save(file, _reference_table(rig, frame, depth * carla_files.DEPTH_RANGE_M, tags, scan))
+            return file.getvalue()
+        keep: Callable[[np.ndarray], np.ndarray] = _without_own_car
+        depth_m, points_m = np.where(depth < 1.0, depth * carla_files.DEPTH_RANGE_M, np.inf), scan.points_m
+    else:
+        depth_m = recorder.decode_depth(files.read_image(frame.depth, None))
+        points_m = files.read_npz(frame.points, "points_m").astype(np.float32)
+        if depth_m.ndim != 2 or points_m.shape[1:] != (3,):
+            raise schema.DataError(f"{frame.depth}, {frame.points}: depth of shape {list(depth_m.shape)}, points of "
+                                   f"{list(points_m.shape)}; expected [H, W] and [N, 3].")
+        points_m = files.finite_points(points_m, frame.points)
+        keep = _all
+    intrinsics, camera_to_ego = _pinhole(rig.camera, depth_m.shape, frame.depth)
+    if rig.rule == "reference":
+        seen_m = camera_ops.depth_to_points(depth_m, intrinsics, camera_to_ego)
+        occupancy = voxel_ops.voxelize(np.concatenate([seen_m, points_m]), rig.grid)
+    else:
+        occupancy = carved_occupancy(depth_m, points_m, intrinsics, camera_to_ego, rig.lidar_position_m, rig.grid,
+                                     keep=keep)
+    return recorder.npz_bytes({"occupancy": occupancy})
+
+
+def _reference_table(rig: Rig, frame: Frame, depth_m: np.ndarray, tags: np.ndarray,
+                     scan: carla_files.Points) -> np.ndarray:
+    if scan.tags is None:
+        raise schema.DataError(f"{frame.points}: no ObjTag, what each point hit; the reference rule labels with it. "
+                               f"Use the rule {RULES[0]}.")
+    fov_rad, position_m = carla.FOV_RAD, carla.MOUNT_M
+    if rig.camera is not None:
+        intrinsics, camera_to_ego = _pinhole(rig.camera, depth_m.shape, frame.depth)
+        centre_px = (depth_m.shape[1] / 2, depth_m.shape[0] / 2)
+        if not (np.allclose(camera_to_ego[:3, :3], _LEVEL) and np.allclose(intrinsics[:2, 2], centre_px)):
+            raise schema.DataError(f"{carla.SENSORS_FILE}: the reference rule knows only level cameras with a centred "
+                                   f"principal point. Use the rule {RULES[0]}.")
+        fov_rad = 2.0 * math.atan(0.5 * depth_m.shape[1] / float(intrinsics[0, 0]))
+        x_m, y_m, z_m = map(float, camera_to_ego[:3, 3])
+        position_m = (x_m, y_m, z_m)
+    seen_m, pixel = camera_ops.reference_depth_points(depth_m, fov_rad, position_m)
+    points_m, hit = np.concatenate([seen_m, scan.points_m]), np.concatenate([tags.reshape(-1)[pixel], scan.tags])
+    kept = ~carla_files.in_ego_box(points_m)
+    return voxel_ops.voxel_table(points_m[kept], hit[kept], rig.grid, winning_tag=carla_files.ROAD_LINE)
+
+
+def _all(points_m: np.ndarray) -> np.ndarray:
+    return points_m
+
+
+def _without_own_car(points_m: np.ndarray) -> np.ndarray:
+    return points_m[~carla_files.in_ego_box(points_m)]
+
+
+def _pinhole(camera: schema.Camera | None, shape: tuple[int, ...],
+             path: pathlib.Path) -> tuple[np.ndarray, np.ndarray]:
+    height_px, width_px = shape
+    if camera is None:
+        return (camera_ops.intrinsics_from_fov(width_px, height_px, carla.FOV_RAD),
+                camera_ops.level_camera_to_ego(carla.MOUNT_M))
+    if (camera.width_px, camera.height_px) != (width_px, height_px):
+        raise schema.DataError(f"{path}: {width_px}x{height_px} pixels, but the camera is described with "
+                               f"{camera.width_px}x{camera.height_px}; depth must be that of the image.")
+    return np.asarray(camera.intrinsics, np.float32), np.asarray(camera.camera_to_ego, np.float32)
+
+
+def _add_column(folder: pathlib.Path, frames: list[Frame]) -> None:
+    """Tells the data frame where the voxels are, as the authors' tool does; the original is kept beside it."""
+    path = folder / carla.FRAME_FILE
+    columns = safe_pickle.load_table(path)
+    if "voxel_path" in columns:
+        return
+    names = [frame.target.relative_to(folder).as_posix() for frame in frames]
+    if not (folder / ORIGINAL_FRAME_FILE).exists():
+        shutil.copyfile(path, folder / ORIGINAL_FRAME_FILE)
+    recorder.write_atomically(path, frame_pickle.frame(dict(columns) | {"voxel_path": names}))

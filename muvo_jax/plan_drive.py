@@ -1,0 +1,230 @@
+"""python -m muvo_jax.plan_drive RUN: a trained world model drives in the built-in town, by planning in imagination."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import pathlib
+import sys
+import time
+from typing import Annotated, Any, Literal
+
+import jax
+import numpy as np
+import rich.table
+import tyro
+
+from muvo_jax import command_line, evaluate
+from muvo_jax import config as config_lib
+from muvo_jax.agents import closed_loop, environment, planners, rewards
+from muvo_jax.data import prepare
+from muvo_jax.data.town import record, settings, simulator
+from muvo_jax.metrics import protocol
+from muvo_jax.model import rollout
+from muvo_jax.training import checkpoint, screen
+from muvo_jax.viz import canvas, sheets
+
+FIRST_SEED = 5_000  # no recorded drive has these seeds
+COASTING = (0.0, 0.0)
+EXPERT, PLANNED = "expert", "planner"
+COLUMNS = {"success": ("success", "{:.0%}"), "collisions": ("collisions", "{}"), "lost": ("off route", "{}"),
+           "route_share": ("route share", "{:.1%}"), "progress_m": ("metres", "{:.1f}"),
+           "progress": ("of expert's metres", "{:.0%}")}
+
+
+@dataclasses.dataclass(frozen=True)
+class Options:
+    """Drives in the built-in town closed loop: filter the sensors, plan in imagination, apply the first action, again.
+
+    The expert drives while the model observes its first frames; then the planner takes over. The expert, coasting and
+    random actions drive the same seeds. Prints a table, writes plan_drive.json, plan_drive.md and plan_drive.gif (the
+    first planned drive).
+    """
+
+    run: Annotated[pathlib.Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
+    """The run's folder."""
+    checkpoint: str = "latest"
+    """latest, best (validation loss) or a step."""
+    episodes: int = 5
+    """Drives of each driver, each with a seed of its own."""
+    seconds: float = 20.0
+    """How long to drive after the takeover."""
+    planner: Literal["icem", "cem", "mppi", "gradient"] = "icem"
+    """How to search: improved or plain cross-entropy method, path integrals, gradient ascent."""
+    horizon: int = 10
+    """Steps to plan ahead."""
+    plans: int = 32
+    """Candidate plans of an iteration (icem, cem, mppi)."""
+    iterations: int = 3
+    """Refinements of a plan."""
+    occupancy_scale: Literal[1, 2, 4] = 1
+    """Look for collisions in the occupancy at 1, 1/2 or 1/4 of its resolution; coarser is faster."""
+    seed: int = 0
+    """Of the drives and of the planner."""
+    out: Annotated[pathlib.Path | None, command_line.shown("PATH", "RUN/plan_drive")] = None
+    """Where to write."""
+
+
+EXAMPLES = """
+python -m muvo_jax.plan_drive runs/town-tr
+python -m muvo_jax.plan_drive runs/town-tr --planner=mppi --horizon=15
+python -m muvo_jax.plan_drive runs/town-tr --episodes=2 --seconds=8 --seed=1
+"""
+
+
+def plan_drive(options: Options, show: screen.Screen) -> dict[str, Any]:
+    """Does what the command line asks for; returns what plan_drive.json holds."""
+    loaded = checkpoint.load_run(options.run, evaluate.which(options.checkpoint))
+    for text in loaded.warnings:
+        show.warn(text)
+    config = loaded.config
+    if options.episodes < 1 or options.seconds <= 0:
+        raise ValueError(f"--episodes is {options.episodes} and --seconds {options.seconds}; both must be positive.")
+    town = simulator.Town(settings.from_config(config))
+    world = town_simulator(town, config)
+    imagination = environment.make(loaded.model, config, reward_config=rewards.RewardConfig(
+        occupancy_scale=options.occupancy_scale, collision=5.0 if "occupancy" in config.model.heads else 0.0))
+    planner = closed_loop.planning_driver(world, imagination, loaded.variables, *planner_of(options),
+                                          horizon=options.horizon)
+    drivers = {PLANNED: planner, EXPERT: closed_loop.expert_driver(world),
+               "constant": closed_loop.constant_driver(COASTING), "random": closed_loop.random_driver()}
+    steps, context = max(1, round(options.seconds / world.step_s)), config.data.context
+    seeds = [FIRST_SEED + 100 * options.seed + episode for episode in range(options.episodes)]
+    drives: dict[str, list[closed_loop.Drive]] = {name: [] for name in drivers}
+    began_s = time.perf_counter()
+    for name, driver in drivers.items():
+        for seed in seeds:
+            key = jax.random.fold_in(jax.random.key(options.seed), seed)
+            drives[name].append(closed_loop.drive(world, driver, key, seed, steps, context=context))
+        show.line(f"{name}: {len(seeds)} drives, {time.perf_counter() - began_s:.0f} s so far", style="dim")
+    scores = closed_loop.summarise(drives, EXPERT, town.config.route_m)
+    report = {"run": str(loaded.folder), "step": loaded.step, "planner": options.planner, "horizon": options.horizon,
+              "plans": options.plans, "iterations": options.iterations, "occupancy_scale": options.occupancy_scale,
+              "step_s": world.step_s, "seconds": options.seconds, "seeds": seeds, "route_m": town.config.route_m,
+              "scores": scores, "drives": {name: [describe(one, seed) for one, seed in zip(runs, seeds, strict=True)]
+                                           for name, runs in drives.items()},
+              "packages": checkpoint.package_versions()}
+    show.console.print(screen_table(scores, options))
+    folder = options.out or loaded.folder / "plan_drive"
+    folder.mkdir(parents=True, exist_ok=True)
+    numbers, page = folder / "plan_drive.json", folder / "plan_drive.md"
+    numbers.write_text(json.dumps(evaluate.json_ready(report), indent=1) + "\n", encoding="utf-8")
+    page.write_text(markdown(report), encoding="utf-8")
+    pictures = film(loaded, town, drives[PLANNED][0], options)
+    for path in (numbers, page, canvas.save_gif(folder / "plan_drive.gif", pictures, world.step_s)):
+        show.line(f"wrote {path}")
+    return report
+
+
+def planner_of(options: Options) -> tuple[str, planners.PlannerConfig]:
+    """The planner's name in planners.PLANNERS and its settings; iCEM is CEM with kept elites and coloured noise."""
+    elites = max(1, min(8, options.plans // 4))
+    improved = {"kept": min(3, elites)} if options.planner == "icem" else {"kept": 0, "noise_exponent": 0.0}
+    settings_ = planners.PlannerConfig(plans=options.plans, iterations=options.iterations, elites=elites, **improved)
+    return "cem" if options.planner == "icem" else options.planner, settings_
+
+
+def town_simulator(town: simulator.Town, config: config_lib.Config) -> closed_loop.Simulator:
+    """The town at the model's rate: an action is held for data.stride periods. As in recordings, the expert first
+    settles in."""
+    def reset(seed):
+        state = town.reset(seed)
+        for _ in range(record.WARM_UP_FRAMES):
+            state = town.step(state, town.expert(state))
+        return state
+
+    def step(state, action):
+        for _ in range(config.data.stride):
+            if state.collided:  # whatever comes later in the step, it stays collided
+                break
+            state = town.step(state, action)
+        return state
+
+    def situation(state):
+        collided, over = bool(state.collided), town.is_terminal(state)
+        arrived = over and int(state.progress) >= len(state.route_m) - simulator.ROUTE_END_POINTS
+        return closed_loop.Situation(float(state.progress) * simulator.ROUTE_STEP_M, collided,
+                                     over and not collided and not arrived, arrived and not collided)
+
+    return closed_loop.Simulator(reset, step, lambda state: observation(town.render(state), config), situation,
+                                 town.expert, config.data.stride / config.contract.rate_hz)
+
+
+def observation(seen, config: config_lib.Config) -> dict[str, Any]:
+    """What the model reads of a rendered moment, and what rewards need: fields of types.Batch without B and T."""
+    fields = {"image": seen["image"], "range_view": seen["range_view"], "route_map": seen["route_map"],
+              "speed_mps": np.float32(seen["speed_mps"])}
+    if config.model.lidar == "pp":
+        fields["points"], fields["point_count"] = prepare.padded_points(seen["points_m"], config.model.pillars.points,
+                                                                        0)
+    return fields
+
+
+def film(loaded: checkpoint.LoadedRun, town: simulator.Town, drive: closed_loop.Drive,
+         options: Options) -> list[np.ndarray]:
+    """Frames of a planned drive: the town, what the model makes of it, what it expects at the end of its plan."""
+    model, variables, key = loaded.model, loaded.variables, jax.random.key(options.seed)
+    heads = tuple(head for head in protocol.HEADS if head in model.config.heads)
+    states, plans = closed_loop.latents(drive.moments)
+    dreamt = rollout.imagine(model, variables, key, states, plans, sampled=False)
+    views = []
+    for latent in (states, jax.tree.map(lambda leaf: leaf[:, -1], dreamt.states)):
+        decoded = rollout.decode(model, variables, latent, heads)
+        frames = jax.device_get(protocol.finish({head: scales[1] for head, scales in decoded.items()}))
+        views.append(sheets.views_of_frames({head: value[None] for head, value in frames.items()}, 0))
+    scene = sheets.Scene.of(loaded.config)
+    pictures = []
+    for index, moment in enumerate(drive.moments):
+        seen = town.render(moment.state)
+        truth = sheets.View(seen["image"], seen["range_view"], town.occupancy(seen))
+        columns = [("town", truth), ("world model, now", views[0][index]),
+                   (f"imagined under the plan, in {options.horizon * scene.frame_s:.1f} s", views[1][index])]
+        caption = (f"{index * scene.frame_s:4.1f} s   {3.6 * float(moment.state.speed_mps):3.0f} km/h   "
+                   f"expected return {float(moment.memory.value):+.2f}")
+        pictures.append(sheets.dream_frame(columns, scene, badge="observed", caption=caption, action=moment.action))
+    return pictures
+
+
+def describe(drive: closed_loop.Drive, seed: int) -> dict[str, Any]:
+    """One drive for the report."""
+    end = drive.end
+    return {"seed": seed, "progress_m": drive.progress_m, "steps": drive.steps, "collided": end.collided,
+            "lost": end.lost, "arrived": end.arrived}
+
+
+def rows(scores) -> list[list[str]]:
+    return [[name, *(form.format(score[column]) for column, (_, form) in COLUMNS.items())]
+            for name, score in scores.items()]
+
+
+def screen_table(scores, options: Options) -> rich.table.Table:
+    """A row for each driver."""
+    table = rich.table.Table(title=f"{options.episodes} drives of {options.seconds:g} s, {options.planner}",
+                             title_justify="left")
+    for name in ("driver", *(label for label, _ in COLUMNS.values())):
+        table.add_column(name, justify="left" if name == "driver" else "right")
+    for row in rows(scores):
+        table.add_row(*row)
+    return table
+
+
+def markdown(report) -> str:
+    """The report as a page."""
+    lines = [f"# {pathlib.Path(report['run']).name}: driving by imagination", "",
+             f"Step {report['step']}; {report['planner']}, {report['horizon']} steps of {report['step_s']:g} s, "
+             f"{report['plans']} plans, {report['iterations']} iterations. {len(report['seeds'])} drives of "
+             f"{report['seconds']:g} s with the seeds {', '.join(map(str, report['seeds']))}.", "",
+             "| driver | " + " | ".join(label for label, _ in COLUMNS.values()) + " |",
+             "|---|" + "---:|" * len(COLUMNS)]
+    lines += ["| " + " | ".join(row) + " |" for row in rows(report["scores"])]
+    lines += ["", f"Success: driven to the end of the time without a collision and without leaving the route. Metres "
+                  f"count along the route until then; its whole length is {report['route_m']:g} m.", ""]
+    return "\n".join(lines)
+
+
+def main() -> int:
+    return command_line.run(Options, plan_drive, program="plan_drive", examples=EXAMPLES)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,82 @@
+"""python -m muvo_jax.record_carla OUT: records the paper's drives from a running CARLA server."""
+
+from __future__ import annotations
+
+import dataclasses
+import pathlib
+import sys
+from typing import Annotated
+
+import tyro
+
+from muvo_jax import command_line
+from muvo_jax.data import carla_client, carla_recorder
+from muvo_jax.training import screen
+
+
+@dataclasses.dataclass(frozen=True)
+class Options:
+    """Records camera, depth, classes, lidar and route map from a running CARLA server (extra [carla]) in the plain
+    format. Complete runs that are there already are kept, the rest is recorded; docs/data.md says what is recorded and
+    what has not been tried on a live server.
+    """
+
+    out: Annotated[pathlib.Path, tyro.conf.Positional, tyro.conf.arg(metavar="OUT")]
+    """Folder of the recording."""
+    estimate: bool = False
+    """Print what disk and hours it takes, and stop; needs no server."""
+    agent: Annotated[str | None, command_line.shown("MODULE:FUNCTION", "autopilot")] = None
+    """The expert: function(vehicle, route) -> agent, agent(observed) -> carla.VehicleControl."""
+    towns: tuple[str, ...] = carla_recorder.TOWNS
+    """Maps of the server."""
+    train_runs: int = 25
+    """Runs for training in each town."""
+    val_runs: int = 5
+    """Runs in each town for either validation split."""
+    seconds: float = carla_recorder.RUN_S
+    """Length of a run."""
+    seed: int = 0
+    """Of weathers, routes and traffic."""
+    vehicles: int = 80
+    """Other cars."""
+    walkers: int = 80
+    """Pedestrians."""
+    host: str = "127.0.0.1"
+    """Where the server runs."""
+    port: int = 2000
+    """Its port."""
+    traffic_port: int = 8000
+    """Port for the traffic manager."""
+
+
+EXAMPLES = """
+python -m muvo_jax.record_carla recordings/carla --estimate
+python -m muvo_jax.record_carla recordings/carla
+python -m muvo_jax.record_carla recordings/small --towns Town01 --train-runs=2 --val-runs=1 --seconds=60
+python -m muvo_jax.record_carla recordings/mine --agent=my_driver:make_agent
+"""
+
+
+def record(options: Options, show: screen.Screen) -> None:
+    """Does what the command line asks for."""
+    settings = carla_recorder.Settings()
+    jobs = carla_recorder.plan(towns=options.towns, train_runs=options.train_runs, val_runs=options.val_runs,
+                               run_s=options.seconds, seed=options.seed)
+    needed = carla_recorder.estimate(options.out, jobs, settings)
+    show.line(str(needed))
+    if options.estimate or not needed.missing:
+        return
+    make_agent = carla_client.load_agent(options.agent) if options.agent else None
+    client = carla_client.Client(settings, host=options.host, port=options.port, traffic_port=options.traffic_port,
+                                 vehicles=options.vehicles, walkers=options.walkers, make_agent=make_agent)
+    with show.counter("recording", "frames") as progress:
+        carla_recorder.record(options.out, client, jobs, settings, progress=progress)
+    show.line(f"{len(jobs)} runs are complete in {options.out}.")
+
+
+def main() -> int:
+    return command_line.run(Options, record, program="record_carla", examples=EXAMPLES)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

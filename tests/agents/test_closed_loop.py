@@ -1,0 +1,134 @@
+import dataclasses
+
+import jax
+import numpy as np
+import pytest
+import worlds
+
+from muvo_jax import command_line, plan_drive, presets
+from muvo_jax.agents import closed_loop, planners
+from muvo_jax.data.town import settings
+from muvo_jax.data.town import simulator as town_lib
+
+STEP_S = 0.2
+FAST = planners.PlannerConfig(plans=8, iterations=2, elites=2, kept=1)
+
+
+def road(wall_m=1e9, end_m=1e9):
+    """A straight road: the state is (metres, speed); full throttle adds 1 m/s in a step, the expert drives 5 m/s."""
+    height, width = worlds.CONFIG.image_size
+    grid = worlds.CONFIG.range_view
+    route_map = np.zeros((64, 64), np.uint8)
+    route_map[:, 30:34] = 255
+
+    def step(state, action):
+        speed = max(0.0, state[1] + float(action[0]))
+        return state[0] + STEP_S * speed, speed
+
+    def observe(state):
+        return {"image": np.full((height, width, 3), 100, np.uint8), "route_map": route_map,
+                "range_view": np.zeros((grid.rows, grid.columns, 4), np.float32), "speed_mps": np.float32(state[1])}
+
+    return closed_loop.Simulator(
+        reset=lambda seed: (float(seed), 5.0), step=step, observe=observe, step_s=STEP_S,
+        situation=lambda state: closed_loop.Situation(state[0], collided=state[0] > wall_m, arrived=state[0] > end_m),
+        expert=lambda state: np.array([5.0 - state[1], 0.0]))
+
+
+def run(simulator, driver, steps=5, context=2, seed=0):
+    return closed_loop.drive(simulator, driver, jax.random.key(0), seed, steps, context=context)
+
+
+def test_a_drive_counts_metres_from_the_takeover():
+    drive = run(road(), closed_loop.constant_driver((0.5, 0.0)), steps=3)
+    assert drive.progress_m == pytest.approx(STEP_S * (5.5 + 6.0 + 6.5))  # the context's two steps are not in it
+    assert drive.steps == 3 and drive.unharmed
+    assert [moment.state[1] for moment in drive.moments] == [5.0, 5.5, 6.0]
+
+
+def test_a_drive_ends_at_a_collision_and_at_the_end_of_the_route():
+    braking_late = closed_loop.constant_driver((0.0, 0.0))
+    crash = run(road(wall_m=4.5), braking_late)
+    assert crash.end.collided and not crash.unharmed and crash.steps == 3
+    assert crash.progress_m == pytest.approx(3.0)
+    arrival = run(road(end_m=3.5), braking_late)
+    assert arrival.end.arrived and arrival.unharmed and arrival.steps == 2
+
+
+def test_a_drive_that_is_over_before_the_takeover_is_refused():
+    with pytest.raises(ValueError, match=r"seed 7 .* over before the takeover"):
+        run(road(wall_m=8.5), closed_loop.random_driver(), seed=7)
+
+
+def test_random_drivers_of_one_key_agree_and_use_each_key_once():
+    drives = [run(road(), closed_loop.random_driver()) for _ in range(2)]
+    actions = np.array([[moment.action for moment in drive.moments] for drive in drives])
+    np.testing.assert_array_equal(actions[0], actions[1])
+    assert len(np.unique(actions[0])) == actions[0].size and (np.abs(actions) <= 1).all()
+
+
+def test_scores_are_relative_to_the_experts_metres():
+    world = road(wall_m=6.5)
+    drives = {"expert": [run(road(), closed_loop.expert_driver(road()))] * 2,
+              "constant": [run(world, closed_loop.constant_driver((0.0, 0.0))), run(road(), closed_loop.constant_driver(
+                  (0.0, 0.0)))]}
+    scores = closed_loop.summarise(drives, "expert", route_m=50.0)
+    assert scores["expert"]["progress"] == 1.0 and scores["expert"]["success"] == 1.0
+    assert scores["expert"]["route_share"] == pytest.approx(5 * STEP_S * 5 / 50)
+    assert scores["constant"]["success"] == 0.5 and scores["constant"]["collisions"] == 1
+    assert scores["constant"]["progress"] == pytest.approx((5.0 + 5.0) / 10.0)
+
+
+def test_the_planner_filters_every_step_plans_for_progress_and_compiles_once():
+    environment, _ = worlds.make()
+    world = road()
+    driver = closed_loop.planning_driver(world, environment, worlds.variables(), config=FAST, horizon=4)
+    compiled = closed_loop.plan_step._cache_size()
+    planned = run(world, driver, steps=6, context=3)
+    assert closed_loop.plan_step._cache_size() == compiled + 1
+    assert planned.moments[-1].memory.live.frame == 3 + 6
+    coasting = run(world, closed_loop.constant_driver((0.0, 0.0)), steps=6, context=3)
+    assert planned.progress_m > coasting.progress_m  # at 5 m/s, half the limit, imagination pays for accelerating
+    again = run(world, driver, steps=6, context=3)
+    assert again.progress_m == planned.progress_m
+    states, plans = closed_loop.latents(planned.moments)
+    assert plans.shape == (6, 4, 2) and states.features.shape[0] == 6
+
+
+@pytest.mark.parametrize(("options", "message"), [
+    ({"planner": "a-star"}, "planner 'a-star' is unknown; known are cem, mppi, gradient"),
+    ({"horizon": 0}, "horizon is 0"),
+    ({"simulator": dataclasses.replace(road(), step_s=0.1)}, "simulator steps 0.1 s, the model 0.2 s"),
+])
+def test_what_cannot_be_planned_is_refused(options, message):
+    environment, _ = worlds.make()
+    with pytest.raises(ValueError, match=message):
+        closed_loop.planning_driver(**{"simulator": road(), "environment": environment, "variables": {}} | options)
+
+
+def test_the_town_gives_what_the_model_reads_at_the_models_rate():
+    config = presets.get("tiny")
+    town = town_lib.Town(settings.from_config(config))
+    world = plan_drive.town_simulator(town, config)
+    drive = run(world, closed_loop.expert_driver(world), steps=4, context=1, seed=plan_drive.FIRST_SEED)
+    assert drive.unharmed and drive.progress_m > 1.0
+    state = drive.moments[0].state
+    assert int(world.step(state, drive.moments[0].action).frame) == int(state.frame) + config.data.stride
+    seen = world.observe(state)
+    assert seen["image"].shape == (*config.model.image_size, 3) and seen["image"].dtype == np.uint8
+    assert seen["range_view"].shape == (config.model.range_view.rows, config.model.range_view.columns, 4)
+    assert seen["route_map"].shape == (64, 64)
+
+
+def test_help_shows_examples_and_explains_every_option(capsys):
+    with pytest.raises(SystemExit) as ended:
+        command_line.run(plan_drive.Options, lambda *_: None, program="plan_drive", arguments=["--help"],
+                         examples=plan_drive.EXAMPLES)
+    text = capsys.readouterr().out
+    assert ended.value.code == 0 and text.count("python -m muvo_jax.plan_drive ") >= 3 and "None" not in text
+
+
+def test_icem_is_cem_with_kept_elites():
+    name, improved = plan_drive.planner_of(plan_drive.Options(run="r"))
+    plain_name, plain = plan_drive.planner_of(plan_drive.Options(run="r", planner="cem"))
+    assert name == plain_name == "cem" and improved.kept > 0 and plain.kept == 0 and plain.noise_exponent == 0

@@ -1,0 +1,168 @@
+"""Occupancy from depth and lidar: the authors' own voxel files, carving worked by hand, and interruptions."""
+
+import shutil
+
+import numpy as np
+import pytest
+import recording_samples as samples
+import recording_writers as writers
+from PIL import Image
+
+from muvo_jax import voxelize as command
+from muvo_jax.data import carla, plain, recorder, safe_pickle, schema, voxelizing
+
+needs_layout = pytest.mark.skipif(samples.MUVO_LAYOUT is None,
+                                  reason="no recording in the MUVO layout here; name one by MUVO_LAYOUT=FOLDER")
+# Camera at (-7.5, 0.5, 0.5) in a grid of 1 m from (-8, -8, -2): its axis runs along row y 8, layer z 2.
+CAMERA_TO_EGO = "[[0, 0, 1, -7.5], [-1, 0, 0, 0.5], [0, -1, 0, 0.5], [0, 0, 0, 1]]"
+
+
+@pytest.fixture
+def recording(tmp_path):
+    """Two runs of two frames, 3x3 pixels and one lidar point; the middle pixel sees 5 m, the others nothing."""
+    root = writers.write_plain(
+        tmp_path / "mesuré ici", {"train/a": 2, "val_rl/c": 2}, width_px="3", height_px="3",
+        intrinsics="[[1, 0, 1.5], [0, 1, 1.5], [0, 0, 1]]", camera_to_ego=CAMERA_TO_EGO, position_m="[-7.5, 5.5, 0.5]")
+    depth_m = np.zeros((3, 3))
+    depth_m[1, 1] = 5.0
+    for run in (root / "train/a", root / "val_rl/c"):
+        shutil.rmtree(run / "occupancy")
+        (run / "depth").mkdir()
+        for frame in range(2):
+            Image.new("RGB", (3, 3)).save(run / f"image/{frame:06d}.png")
+            Image.fromarray(recorder.encode_depth(depth_m)).save(run / f"depth/{frame:06d}.png")
+            np.savez(run / f"lidar/{frame:06d}.npz", points_m=np.array([[-3.5, 5.5, 0.5]], np.float32))
+    return root
+
+
+def occupancy(root, run="train/a", frame=0):
+    return np.load(root / run / f"occupancy/{frame:06d}.npz")["occupancy"]
+
+
+def test_rays_carve_what_they_pass_and_the_rest_is_unknown(recording):
+    progress = []
+    result = voxelizing.voxelize(recording, workers=1, progress=lambda *counts: progress.append(counts))
+    assert result == (4, 0) and progress == [(4, 4)]
+    grid = occupancy(recording)
+    expected = np.full((16, 16, 16), 255, np.uint8)
+    expected[0:5, 8, 2], expected[5, 8, 2] = 0, 1  # the camera: from x -7.5 to -2.5
+    expected[0:4, 13, 2], expected[4, 13, 2] = 0, 1  # the lidar: to x -3.5
+    np.testing.assert_array_equal(grid, expected)
+    read = plain.PlainRecording(recording)
+    np.testing.assert_array_equal(read.read(read.sequences[-1], 1)["occupancy"], expected)
+
+
+def test_sky_carves_to_the_border(recording):
+    Image.fromarray(np.array([[0, 0, 0], [0, 65535, 0], [0, 0, 0]], np.uint16)).save(
+        recording / "train/a/depth/000000.png")
+    voxelizing.voxelize(recording, workers=1)
+    grid = occupancy(recording)
+    assert (grid[:, 8, 2] == 0).all() and (grid == 1).sum() == 1
+    assert (occupancy(recording, frame=1)[6:, 8, 2] == 255).all()
+
+
+def test_the_reference_rule_calls_all_else_empty(recording):
+    voxelizing.voxelize(recording, rule="reference", workers=1)
+    assert np.argwhere(occupancy(recording) == 1).tolist() == [[4, 13, 2], [5, 8, 2]]
+    assert (occupancy(recording) == 255).sum() == 0
+    with pytest.raises(FileExistsError, match=r"reference.* not by .*carved.*--overwrite"):
+        voxelizing.voxelize(recording, workers=1)
+    assert voxelizing.voxelize(recording, overwrite=True, workers=1) == (4, 0)
+    assert (occupancy(recording) == 255).any()
+
+
+def test_whole_files_are_kept_and_half_ones_made_again(recording):
+    voxelizing.voxelize(recording, workers=1)
+    folder = recording / "train/a/occupancy"
+    whole = (folder / "000000.npz").read_bytes()
+    (folder / "000000.npz").write_bytes(whole[:-10])
+    (folder / "000001.npz").unlink()
+    (folder / ".000001.npz.123").write_bytes(whole[:10])  # what kill -9 leaves
+    theirs = recording / "val_rl/c/occupancy/000001.npz"
+    np.savez(theirs, occupancy=np.zeros((16, 16, 16), np.uint8))
+    kept = theirs.read_bytes()
+    assert voxelizing.voxelize(recording, workers=1) == (2, 2)
+    assert (folder / "000000.npz").read_bytes() == whole and theirs.read_bytes() == kept
+    assert sorted(path.name for path in folder.iterdir()) == ["000000.npz", "000001.npz", "rule.json"]
+
+
+def test_frames_that_cannot_be_made_are_named_and_the_others_done(recording):
+    (recording / "train/a/depth/000001.png").write_bytes(b"no image")
+    with pytest.raises(schema.DataError, match=r"1 of 4 frames have no occupancy.*000001\.png: not a readable image"):
+        voxelizing.voxelize(recording, workers=1)
+    assert len(list(recording.glob("*/*/occupancy/*.npz"))) == 3
+
+
+def test_missing_sensors_are_told_before_anything_is_written(recording, tmp_path, capsys):
+    shutil.rmtree(recording / "val_rl/c/depth")
+    assert command.command_line.run(command.Options, command.voxelize, program="voxelize",
+                                    arguments=[str(recording)]) == 1
+    assert "no frame has a depth map" in capsys.readouterr().err
+    shutil.rmtree(recording / "train/a/lidar")
+    with pytest.raises(schema.DataError, match="no frame has a lidar scan"):
+        voxelizing.voxelize(recording)
+    assert not list(recording.glob("*/*/occupancy"))
+    header = recording / plain.DESCRIPTION_FILE
+    header.write_text(header.read_text().partition("[voxels]")[0])
+    with pytest.raises(schema.DataError, match=r"no section \[voxels\], the grid to fill; add one"):
+        voxelizing.voxelize(recording)
+    with pytest.raises(schema.DataError, match="is no recording whose occupancy can be made"):
+        voxelizing.voxelize(tmp_path / "elsewhere")
+
+
+def test_a_second_command_on_one_folder_is_told(recording):
+    pytest.importorskip("fcntl")
+    with (voxelizing.processes.locked(recording / ".voxelizing", "voxelizing"),
+          pytest.raises(BlockingIOError, match="another process is voxelizing here now")):
+        voxelizing.voxelize(recording, workers=1)
+
+
+@pytest.fixture
+def layout(tmp_path):
+    """The first twelve frames of the sample's first run, as files; its data frame names all."""
+    run = "trainval/train/Town01/0000"
+    shutil.copytree(samples.MUVO_LAYOUT / run, tmp_path / run, ignore=lambda _, names: [
+        name for name in names if name[-13:-4].isdigit() and int(name[-13:-4]) > 11])
+    for path in (tmp_path, *tmp_path.rglob("*")):
+        path.chmod(0o755)
+    return tmp_path
+
+
+@needs_layout
+def test_the_reference_rule_writes_the_authors_voxels(layout):
+    run = layout / "trainval/train/Town01/0000"
+    table = safe_pickle.load_table(run / carla.FRAME_FILE)
+    shutil.rmtree(run / "voxel")
+    columns = {name: cells[:12] for name, cells in table.items() if name != "voxel_path"}
+    (run / carla.FRAME_FILE).write_bytes(voxelizing.frame_pickle.frame(columns))
+    assert voxelizing.voxelize(layout, rule="reference", workers=2) == (12, 0)
+    for path in (run / "voxel").glob("*.npy"):
+        assert path.read_bytes() == (samples.MUVO_LAYOUT / path.relative_to(layout)).read_bytes()
+    written = safe_pickle.load_table(run / carla.FRAME_FILE)
+    assert list(written) == list(table) and list(written["voxel_path"]) == list(table["voxel_path"][:12])
+    for name in columns:
+        for old, new in zip(columns[name], written[name], strict=True):
+            np.testing.assert_array_equal(old, new)
+    assert list(safe_pickle.load_table(run / voxelizing.ORIGINAL_FRAME_FILE)) == list(columns)
+
+
+@needs_layout
+def test_carved_occupancy_of_the_layout_is_read_in_place_of_its_voxels(layout):
+    run = layout / "trainval/train/Town01/0000"
+    table = safe_pickle.load_table(run / carla.FRAME_FILE)
+    (run / carla.FRAME_FILE).write_bytes(voxelizing.frame_pickle.frame(
+        {name: cells[:12] for name, cells in table.items()}))
+    opened = carla.CarlaRecording(layout)
+    theirs = opened.read(opened.sequences[0], 1)["occupancy"]
+    before = (run / "voxel/voxel_000000011.npy").read_bytes()
+    assert voxelizing.voxelize(layout, workers=1).made == 12
+    opened = carla.CarlaRecording(layout)
+    frame = opened.read(opened.sequences[0], 1)
+    ours = frame["occupancy"]
+    assert set(np.unique(ours)) == {0, 1, 255}
+    hit = np.floor((frame["points_m"] - opened.description.voxels.origin_m) / 0.5).astype(int)
+    hit = hit[((hit >= 0) & (hit < ours.shape)).all(axis=1)]
+    assert (ours[tuple(hit.T)] == 1).all()
+    # Pixels are lifted half a pixel apart, so that hits at the borders of voxels differ.
+    assert (ours == 1)[theirs == 1].mean() > 0.8
+    assert (run / "voxel/voxel_000000011.npy").read_bytes() == before

@@ -8,8 +8,8 @@ import golden_rule
 import numpy as np
 import pytest
 
-from muvo_jax.interop import packs, weights_rule
-from muvo_jax.interop.parity import cases, geometry, losses, modules_1d, registry, runner
+from muvo_jax.interop import packs, reference_data, weights_rule
+from muvo_jax.interop.parity import cases, geometry, losses, modules_1d, pooling, registry, runner
 
 SILENT = lambda line: None
 # Only the losses that the made-up packs hold: the others would be computed for nothing.
@@ -141,7 +141,20 @@ def test_losses():
 
 
 def test_geometry():
-    assert checked("p2", "p2_geometry.npz", geometry.GROUPS).passed == 62
+    groups = tuple(group for group in geometry.GROUPS if group not in pooling.GROUPS)
+    assert checked("p2", "p2_geometry.npz", groups).passed == 105
+
+
+@pytest.mark.slow
+def test_pooling_into_cells_of_the_ground():
+    assert checked("p2", "p2_geometry.npz", pooling.GROUPS).passed == 20
+
+
+def test_a_target_lies_north_of_a_car_that_heads_north_or_east():
+    ahead = reference_data.gps_vector(np.array([0.0, 8.0]), np.array([1e-4, 8.0]), np.nan)
+    np.testing.assert_allclose(ahead, [11.1319, 0.0], atol=1e-3)  # a degree is 111,319 m at the equator
+    to_the_left = reference_data.gps_vector(np.array([0.0, 8.0]), np.array([1e-4, 8.0]), np.pi / 2)
+    np.testing.assert_allclose(to_the_left, [0.0, -11.1319], atol=1e-3)
 
 
 def test_modules_of_the_1d_model():

@@ -9,13 +9,13 @@ import numpy as np
 
 from muvo_jax import config as config_lib
 from muvo_jax.interop import packs, reference_preprocess
-from muvo_jax.interop.parity import cases, recordings
+from muvo_jax.interop.parity import cases, pooling, recordings
 from muvo_jax.nn import attention
 from muvo_jax.ops import range_view
 
 Checks = Iterator[cases.Check]
 TOLERANCE, SHARE_TOLERANCE = 1e-5, 1e-4
-_RAW_SIZE = (600, 960)
+_RAW_SIZE, _BIRDVIEW_CELLS = (600, 960), 192
 
 
 def positions(context: cases.Context) -> Checks:
@@ -26,6 +26,15 @@ def positions(context: cases.Context) -> Checks:
             grid = tuple(int(side) for side in match[2].split("x"))
             table = attention.sine_positions(grid, int(match[1]) * len(grid))
             yield cases.Check(entry, table.T.reshape(1, -1, *grid), TOLERANCE)
+    yield cases.Check("pos2d/unnormalised_16_5x7", _counted_positions((5, 7), 16)[None], TOLERANCE)
+
+
+def _counted_positions(grid: tuple[int, int], channels: int) -> np.ndarray:
+    """Sine embedding [2 * channels, *grid] of rows and columns counted from 1; our models use shares of the grid."""
+    periods = 10000.0 ** (2 * (np.arange(channels) // 2) / channels)
+    phase = np.stack(np.indices(grid) + 1)[:, None] / periods[None, :, None, None]
+    odd = (np.arange(channels) % 2 == 1)[None, :, None, None]
+    return np.where(odd, np.cos(phase), np.sin(phase)).reshape(-1, *grid)
 
 
 def cameras(context: cases.Context) -> Checks:
@@ -34,6 +43,8 @@ def cameras(context: cases.Context) -> Checks:
                          ("intrinsics_cropped", reference_preprocess.cropped_intrinsics(matrix)),
                          ("bev_intrinsics_48", reference_preprocess.bev_intrinsics())):
         yield cases.Check(f"camera/{entry}", value, TOLERANCE)
+    mask = reference_preprocess.out_of_view(_RAW_SIZE, _BIRDVIEW_CELLS)
+    yield cases.Check("camera/out_of_view_mask", mask, SHARE_TOLERANCE, packs.Pack.share_different)
 
 
 def projection(context: cases.Context) -> Checks:
@@ -61,6 +72,36 @@ def network_inputs(context: cases.Context) -> Checks:
         yield cases.Check(f"pre/{name}", value, TOLERANCE)
 
 
-GROUPS: tuple[cases.Group, ...] = (positions, cameras, projection, network_inputs, *recordings.GROUPS)
+def optional_labels(context: cases.Context) -> Checks:
+    """Labels of heads that the released models lack; birdviews also without what the camera cannot see."""
+    cells = (1, 2, 1, _BIRDVIEW_CELLS, _BIRDVIEW_CELLS)
+    image = (1, 2, 1, *_RAW_SIZE)
+    birdview = context.draw("pre_bev", cells, "labels8")
+    labels = reference_preprocess.optional_labels({
+        "birdview": birdview, "instance": context.draw("pre_inst", cells, "instance4"),
+        "depth": context.draw("pre_depth", image, "smooth"),
+        "image_instance_mask": context.draw("pre_imask", image, "mask").astype(np.uint8),
+        "semantic_image": context.draw("pre_sem", image, "labels9"),
+        "range_view_pcd_seg": context.draw("pre_rvs", (1, 2, 1, 64, 1024), "labels9")})
+    for name, value in labels.items():
+        yield cases.Check(f"pre/{name}", value, TOLERANCE)
+    visible = np.where(reference_preprocess.out_of_view(_RAW_SIZE, _BIRDVIEW_CELLS), 0, birdview)
+    for scale, value in reference_preprocess.birdview_labels(visible).items():
+        yield cases.Check(f"pre_maskview/birdview_label_{scale}", value, TOLERANCE)
+    small = reference_preprocess.centres_and_offsets(context.draw("inst_small", (1, 2, 1, 20, 24), "instance4"), 4.0)
+    for name, value in zip(("center", "offset"), small, strict=True):
+        yield cases.Check(f"instance/{name}", value, TOLERANCE)
+
+
+def halved_batch(context: cases.Context) -> Checks:
+    image = context.draw("rb_image", (1, 2, 3, 64, 96), "smooth")
+    yield cases.Check("resize_batch_half/image", reference_preprocess.halved_antialiased(image), TOLERANCE)
+    matrix = np.broadcast_to(reference_preprocess.intrinsics(_RAW_SIZE), (1, 2, 3, 3))
+    halved = matrix * np.array([0.5, 0.5, 1.0], np.float32)[:, None]
+    yield cases.Check("resize_batch_half/intrinsics", halved, TOLERANCE)
+
+
+GROUPS: tuple[cases.Group, ...] = (positions, cameras, projection, network_inputs, optional_labels, halved_batch,
+                                   *recordings.GROUPS, *pooling.GROUPS)
 LEFT_OUT = {r".*label_ambiguous": "marks what the pages say not to compare",
             r"pre_antialias/.*": "stored for information only", r"frustum/.*_out_f32": "stored for information only"}

@@ -32,7 +32,8 @@ def positions(context: cases.Context) -> Checks:
 def _counted_positions(grid: tuple[int, int], channels: int) -> np.ndarray:
     """Sine embedding [2 * channels, *grid] of rows and columns counted from 1; our models use shares of the grid."""
     periods = 10000.0 ** (2 * (np.arange(channels) // 2) / channels)
-    phase = np.stack(np.indices(grid) + 1)[:, None] / periods[None, :, None, None]
+    counted = np.asarray(np.indices(grid)) + 1
+    phase = counted[:, None] / periods[None, :, None, None]
     odd = (np.arange(channels) % 2 == 1)[None, :, None, None]
     return np.where(odd, np.cos(phase), np.sin(phase)).reshape(-1, *grid)
 

@@ -188,8 +188,8 @@ def test_resuming_past_a_damaged_checkpoint_says_so_and_reaches_the_same_end(tmp
          and path.stat().st_size > 3000).write_bytes(b"")
     show = Interrupting()
     _train(tmp_path / "run", show, resume=True)
-    text = show.output.getvalue()
-    assert "checkpoints/5 is damaged" in text and "from step 4" in text
+    text = "".join(show.output.getvalue().split())  # a long folder name wraps the line
+    assert "checkpoints/5isdamaged" in text and "fromstep4" in text
     assert (tmp_path / "run" / integrity.DAMAGED_FOLDER / "5").is_dir()
     jax.tree.map(np.testing.assert_array_equal, _final(tmp_path / "run"), uninterrupted[2])
 

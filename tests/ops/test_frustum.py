@@ -6,10 +6,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from golden_rule import Golden, make_input
 
 from muvo_jax.geometry import BirdsEyeGrid
 from muvo_jax.ops import frustum
-from tests.golden_rule import Golden, make_input
 
 GRID = BirdsEyeGrid()
 SIZES = {"small": (5, 13, 3, 64), "full": (40, 104, 4, 8)}

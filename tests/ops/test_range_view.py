@@ -1,11 +1,11 @@
 import numpy as np
 import pytest
+from golden_rule import Golden, make_input
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from muvo_jax import config as config_lib
 from muvo_jax.ops import range_view
-from tests.golden_rule import Golden, make_input
 
 GEOMETRY = config_lib.RangeViewGeometry(rows=64, columns=256)
 LIDAR_M = np.array(GEOMETRY.position_m, np.float32)

@@ -1,12 +1,12 @@
 import numpy as np
 import pytest
+from golden_rule import Golden, make_input
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from muvo_jax import config as config_lib
 from muvo_jax.data import carla_files
 from muvo_jax.ops import camera, voxels
-from tests.golden_rule import Golden, make_input
 
 GRID = config_lib.VoxelGrid(shape=(8, 6, 4), voxel_size_m=0.5, origin_m=(-2.0, -1.0, 0.0))
 

@@ -5,10 +5,11 @@ from __future__ import annotations
 import dataclasses
 from typing import Any, Literal
 
+from muvo_jax.config_augmentation import AugmentationConfig
 from muvo_jax.config_json import check_choice, override, override_all, parse
 from muvo_jax.geometry import BirdsEyeGrid, PillarGrid, RangeViewGeometry, VoxelGrid
 
-__all__ = ["ActionContract", "BirdsEyeGrid", "Config", "DataConfig", "EvaluationConfig", "LossConfig", "ModelConfig",
+__all__ = ["ActionContract", "AugmentationConfig", "BirdsEyeGrid", "Config", "DataConfig", "EvaluationConfig", "LossConfig", "ModelConfig",
            "OptimizerConfig", "PillarGrid", "RangeViewGeometry", "TrainConfig", "VoxelGrid", "override", "override_all",
            "parse"]
 
@@ -321,6 +322,7 @@ class Config:
     loss: LossConfig = LossConfig()
     optimizer: OptimizerConfig = OptimizerConfig()
     data: DataConfig = DataConfig()
+    augmentation: AugmentationConfig = AugmentationConfig()
     train: TrainConfig = TrainConfig()
     evaluation: EvaluationConfig = EvaluationConfig()
     contract: ActionContract = ActionContract()

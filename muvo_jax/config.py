@@ -9,9 +9,9 @@ from muvo_jax.config_augmentation import AugmentationConfig
 from muvo_jax.config_json import check_choice, override, override_all, parse
 from muvo_jax.geometry import BirdsEyeGrid, PillarGrid, RangeViewGeometry, VoxelGrid
 
-__all__ = ["ActionContract", "AugmentationConfig", "BirdsEyeGrid", "Config", "DataConfig", "EvaluationConfig", "LossConfig", "ModelConfig",
-           "OptimizerConfig", "PillarGrid", "RangeViewGeometry", "TrainConfig", "VoxelGrid", "override", "override_all",
-           "parse"]
+__all__ = ["ActionContract", "AugmentationConfig", "BirdsEyeGrid", "Config", "DataConfig", "EvaluationConfig",
+           "LossConfig", "ModelConfig", "OptimizerConfig", "PillarGrid", "RangeViewGeometry", "TrainConfig",
+           "VoxelGrid", "override", "override_all", "parse"]
 
 FUSIONS = ("tr", "fc", "avg")
 LIDAR_ENCODERS = ("rv", "pp")

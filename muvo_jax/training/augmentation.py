@@ -97,7 +97,7 @@ def _random_affine(key: types.Array, degrees: float, side: int, settings: Augmen
 
 def affine(maps: types.Array, angle_rad: types.Array, shift_px: types.Array, scale: types.Array,
            shear_rad: types.Array) -> types.Array:
-    """Shears, turns clockwise and scales square maps [T, S, S] about their centre, then shifts; nearest pixel, 0 outside.
+    """Shears, turns clockwise and scales square maps [T, S, S] about their centre, then shifts them; nearest pixel.
 
     Args:
       angle_rad, scale, shear_rad: scalars.

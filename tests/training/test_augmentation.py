@@ -120,7 +120,7 @@ def test_affine_moves_pixels_where_arithmetic_says():
 
 
 def test_impossible_probabilities_are_refused():
-    with pytest.raises(ValueError, match=r"blur \+ sharpen = 0.8 \+ 0.3"):
+    with pytest.raises(ValueError, match=r"blur \+ sharpen = 0\.8 \+ 0\.3"):
         config_lib.AugmentationConfig(blur=0.8)
-    with pytest.raises(ValueError, match="hue is 0.7"):
+    with pytest.raises(ValueError, match=r"hue is 0\.7"):
         config_lib.AugmentationConfig(hue=0.7)

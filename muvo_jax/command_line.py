@@ -130,6 +130,19 @@ def parse_settings(settings: Iterable[str]) -> dict[str, Any]:
     return parsed
 
 
+def which_checkpoint(text: str) -> str | int:
+    """"latest", "best" or a step, as checkpoint.load_run takes it, from what --checkpoint says.
+
+    Raises:
+      ValueError: for anything else.
+    """
+    if text in ("latest", "best"):
+        return text
+    if text.isdecimal():
+        return int(text)
+    raise ValueError(f"--checkpoint: got {text!r}, expected latest, best or a step such as 400.")
+
+
 def open_data(config: config_lib.Config, show: screen.Screen) -> schema.Recording:
     """The recording that a config names; the built-in town is recorded first where it is not in the cache."""
     if config.data.path == "town":

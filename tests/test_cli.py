@@ -4,6 +4,7 @@ import importlib
 import json
 import os
 import pathlib
+import re
 import subprocess
 import sys
 
@@ -138,6 +139,12 @@ def test_variant_flags_choose_encoders_fusion_latent_and_heads():
     assert model.heads == ("image", "range_view", "action")
     model = train.configure(train.Options(preset="paper", occupancy=True, backbone="mobilevitv2_100"))[0].model
     assert (model.heads, model.backbone) == (config_lib.HEADS, "mobilevitv2_100")
+    model = train.configure(train.Options(preset="tiny", heads="action,image", with_heads="range_view"))[0].model
+    assert model.heads == ("image", "range_view", "action")
+    for options, message in ((train.Options(heads="image,deph"), "--heads: 'deph' is unknown"),
+                             (train.Options(with_heads="occupancy", no_occupancy=True), "contradict each other")):
+        with pytest.raises(ValueError, match=message):
+            train.configure(options)
     model = train.configure(train.Options(preset="reference-2d", fusion="avg"))[0].model
     assert (model.variant, model.latent) == ("RV-WOB-AVG", "1d")
 
@@ -197,3 +204,9 @@ def test_the_whole_job_on_the_smallest_town(tmp_path):
                      XDG_CACHE_HOME=str(tmp_path / "cache"))
     assert again.returncode == 0, again.stderr
     assert list((tmp_path / "out").glob("*.gif"))
+    (code,) = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(encoding="utf-8"), re.DOTALL)
+    code = code.replace("town-tr", "tiny-tr") + "\nprint(predictions['image'][1].shape)"
+    readme = subprocess.run([sys.executable, "-c", code],
+                            cwd=tmp_path, capture_output=True, text=True, check=False,
+                            env={**os.environ, "PYTHONPATH": str(ROOT), "XDG_CACHE_HOME": str(tmp_path / "cache")})
+    assert readme.stdout.split() == ["(2,", "1,", "32,", "64,", "3)"], readme.stderr

@@ -143,6 +143,20 @@ def test_one_compilation_for_equal_shapes(variables, state, actions):
     assert rollout._imagine._cache_size() == before + 2
 
 
+def test_heads_that_nobody_decodes_cost_imagining_nothing():
+    """The compiled program, and so its time and memory, is that of a model without them; nothing in it is voxels."""
+    def program(heads):
+        model = world_model.WorldModel(dataclasses.replace(CONFIG, heads=heads))
+        shapes = jax.eval_shape(lambda: (jax.random.key(0), model.initial_state(BATCH), jnp.zeros((BATCH, HORIZON, 2))))
+        run = jax.jit(lambda *arguments: rollout.imagine(model, *arguments, branches=3))
+        return run.lower(model.variable_shapes(), *shapes)
+
+    whole = program(("image", "range_view", "occupancy", "action"))
+    assert whole.as_text() == program(("action",)).as_text()
+    states = 3 * BATCH * HORIZON * 4 * MODEL.feature_shape[0]
+    assert whole.compile().memory_analysis().temp_size_in_bytes < 16 * states
+
+
 def test_training_windows_use_dropout_and_update_statistics(variables):
     batch, keys = make_batch(), jax.random.split(jax.random.key(4), BATCH)
     # A fresh fusion transformer hands its tokens through: its dropouts show once it was trained.

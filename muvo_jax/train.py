@@ -138,7 +138,8 @@ def configure(options: Options) -> tuple[config_lib.Config, dict[str, Any], path
     if options.augment or options.no_augment:
         if options.augment and options.no_augment:
             raise ValueError("--augment and --no-augment contradict each other: give one of them.")
-        chosen = {f"augmentation.{name}": options.augment for name in ("image", "route")} | chosen
+        for name in ("image", "route"):
+            chosen.setdefault(f"augmentation.{name}", options.augment)
     if chosen.get("model.fusion", "tr") != "tr" and base.model.latent == "2d":
         chosen.setdefault("model.latent", "1d")  # the only one that such a fusion has
     base = config_lib.override_all(base, chosen)

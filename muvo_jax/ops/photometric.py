@@ -21,16 +21,21 @@ def blur(image: Array, std_px: Array | float) -> Array:
     half = _BLUR_PX // 2
     offsets = jnp.arange(-half, half + 1, dtype=jnp.float32)
     weights = jax.nn.softmax(-0.5 * jnp.square(offsets / std_px))
-    padded = jnp.pad(image, ((half, half), (half, half), (0, 0)), mode="reflect")
-    padded = sum(weights[shift] * padded[shift:shift + rows] for shift in range(_BLUR_PX))
-    return sum(weights[shift] * padded[:, shift:shift + columns] for shift in range(_BLUR_PX))
+    for axis, pixels in ((0, rows), (1, columns)):
+        padded = jnp.pad(image, [(half, half) if side == axis else (0, 0) for side in range(3)], mode="reflect")
+        shifted = [jax.lax.slice_in_dim(padded, shift, shift + pixels, axis=axis) for shift in range(_BLUR_PX)]
+        image = jnp.tensordot(weights, jnp.stack(shifted), axes=1)
+    return image
 
 
 def sharpen(image: Array, factor: Array | float) -> Array:
     """Away from a smoothed image where factor > 1; the outermost pixels stay."""
     rows, columns, _ = image.shape
-    around = sum(image[row:row + rows - 2, column:column + columns - 2] for row in range(3) for column in range(3))
-    smooth = jnp.asarray(image).at[1:-1, 1:-1].set((around + 4.0 * image[1:-1, 1:-1]) / 13.0)
+    weighted = 4.0 * image[1:-1, 1:-1]
+    for row in range(3):
+        for column in range(3):
+            weighted += image[row:row + rows - 2, column:column + columns - 2]
+    smooth = jnp.asarray(image).at[1:-1, 1:-1].set(weighted / 13.0)
     return _blend(image, smooth, factor)
 
 

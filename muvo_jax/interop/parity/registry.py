@@ -3,7 +3,17 @@
 from __future__ import annotations
 
 from muvo_jax.interop import packs
-from muvo_jax.interop.parity import cases, full_models, geometry, losses, modules_1d, modules_2d, p6, train_step
+from muvo_jax.interop.parity import (
+    all_losses,
+    cases,
+    full_models,
+    geometry,
+    losses,
+    modules_1d,
+    modules_2d,
+    p6,
+    train_step,
+)
 
 _BACKBONES = "mobilevitv2_100_backbones"
 _FULL_MODELS = tuple(rf"{name}\.npz" for name in packs.manifest_names() if name != _BACKBONES)
@@ -15,6 +25,7 @@ PACKS = (
     cases.PackChecks("p3_2d", (r"p3_modules_2d\.npz",), modules_2d.GROUPS),
     cases.PackChecks("p4", _FULL_MODELS, full_models.GROUPS),
     cases.PackChecks("p4_backbone", (r"mobilevitv2_100_backbone\.npz",), full_models.BACKBONE_GROUPS),
-    cases.PackChecks("p5", (r"p5_train_step_[12]d\.npz",), train_step.GROUPS),
+    cases.PackChecks("p5_losses", (r"p5_losses_all_[12]d\.npz",), all_losses.GROUPS),
+    cases.PackChecks("p5_step", (r"p5_train_step_[12]d\.npz",), train_step.GROUPS),
     cases.PackChecks("p6", (r"p6_\w+\.npz",), p6.GROUPS, needs_recordings=True),
 )

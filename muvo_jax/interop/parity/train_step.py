@@ -7,6 +7,7 @@ with which the reference really trains are entries of their own.
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Iterator
 from typing import Any
 
@@ -26,6 +27,7 @@ from muvo_jax.training import optimizer as optimizer_lib
 Checks = Iterator[cases.Check]
 LOSS_TOLERANCE, STATISTICS_TOLERANCE, NORM_TOLERANCE, NEW_TOLERANCE = 1e-4, 1e-5, 5e-3, 1e-5
 STYLED_TOLERANCE, SCHEDULE_TOLERANCE = 5e-4, 1e-6
+_RATE = 1e-4
 _NOISY = ("encoder.", "range_view_encoder.", "feat_decoder.")
 _TERMS = {"image": "rgb", "range_xyz": "lidar_re", "range_depth": "lidar_depth", "occupancy_cross_entropy": "voxel",
           "occupancy_semantic_scal": "sem_scal", "occupancy_geometric_scal": "geo_scal", "kl": "probabilistic"}
@@ -144,7 +146,7 @@ def _gradients(context: cases.Context, gradients: Any) -> Checks:
 
 def _update(context: cases.Context, params: Any, gradients: Any) -> Checks:
     """One AdamW step with the reference's two groups; weight decay spares parameters with one axis."""
-    adamw = optax.adamw(1e-4, b1=0.9, b2=0.999, eps=1e-8, weight_decay=0.01,
+    adamw = optax.adamw(_RATE, b1=0.9, b2=0.999, eps=1e-8, weight_decay=0.01,
                         mask={"decayed": True, "undecayed": False})
 
     @jax.jit
@@ -157,18 +159,25 @@ def _update(context: cases.Context, params: Any, gradients: Any) -> Checks:
     for key, before in _by_reference_key({"params": params}):
         if f"new/{key}" in context.pack:
             delta = moved[key].reshape(context.pack.shape(f"delta/{key}"))
-            yield cases.Check(f"new/{key}", before.reshape(delta.shape) + delta, NEW_TOLERANCE)
-            yield cases.Check(f"delta/{key}", delta, gradient_tolerance(key), _delta_error)
+            yield cases.Check(f"new/{key}", before.reshape(delta.shape) + delta, NEW_TOLERANCE, _step_error)
+            yield cases.Check(f"delta/{key}", delta, gradient_tolerance(key), _step_error)
 
 
-def _delta_error(pack: packs.Pack, entry: str, got: np.ndarray) -> float:
-    """The error where the gradient's sign, which the first step of Adam follows, is more than noise."""
-    key = entry.removeprefix("delta/")
-    want, have = pack.stored(entry, got)
-    gradient, _ = pack.stored(f"grad/{key}", got)
-    size = np.abs(gradient)
+def _step_error(pack: packs.Pack, entry: str, got: np.ndarray) -> float:
+    """The error where the sign of the gradient is known; infinite where a parameter moved further than it can.
+
+    The first step of Adam is as long as the learning rate whatever the size of the gradient, so where that is noise
+    the step may go either way. It is noise below a thousandth of the largest one (the page of the pack), and below the
+    tolerance of the gradient itself.
+    """
+    key = entry.partition("/")[2]
+    want, have = (value.astype(np.float64) for value in pack.stored(entry, got))
+    size = np.abs(pack.stored(f"grad/{key}", got)[0])
     clear = size > max(1e-3, gradient_tolerance(key)) * size.max()
-    return float(np.abs(want - have)[clear].max(initial=0.0) / max(np.abs(want).max(), 1e-6))
+    apart = np.abs(want - have)
+    if (apart > 2.01 * _RATE).any():
+        return math.inf
+    return float(apart[clear].max(initial=0.0) / max(np.abs(want).max(), 1e-6))
 
 
 def _groups(latent: str) -> Checks:

@@ -1,17 +1,20 @@
 """The commands as a user meets them: help, wrong options, and one clear line for an expected error."""
 
+import importlib
 import json
 import os
 import pathlib
+import re
 import subprocess
 import sys
 
 import pytest
 
 import muvo_jax
+from muvo_jax import __main__ as listing
 from muvo_jax import command_line, evaluate, presets, train
 from muvo_jax import config as config_lib
-from muvo_jax.training import run_folder, screen
+from muvo_jax.training import host, run_folder, screen
 
 ROOT = pathlib.Path(muvo_jax.__file__).parents[1]
 
@@ -33,16 +36,40 @@ def _main(capsys, *arguments):
     return code, capsys.readouterr()
 
 
-@pytest.mark.parametrize("module", ["train", "evaluate", "dream"])
-def test_help_has_examples_and_every_option_explained(module, capsys):
-    options = {"train": train, "evaluate": evaluate}.get(module) or __import__("muvo_jax.dream").dream
+def _module(command):
+    inside = "interop.parity.__main__" if command == "interop.parity" else command
+    return importlib.import_module(f"muvo_jax.{inside}")
+
+
+@pytest.mark.parametrize("command", listing.COMMANDS)
+def test_help_has_examples_and_every_option_explained(command, capsys, monkeypatch):
+    monkeypatch.setattr(host, "restart_with_huge_pages", lambda: None)
+    monkeypatch.setattr(sys, "argv", [command, "--help"])
     with pytest.raises(SystemExit) as ended:
-        command_line.run(options.Options, lambda *_: None, program=module, arguments=["--help"],
-                         examples=options.EXAMPLES)
+        _module(command).main()
     assert ended.value.code == 0
     text = capsys.readouterr().out
-    assert "Examples:" in text and text.count(f"python -m muvo_jax.{module} ") >= 3
+    _, _, examples = text.partition("Examples:")
+    assert f"python -m muvo_jax.{command} " in examples
     assert "None" not in text
+
+
+def test_the_package_alone_lists_every_command(capsys, monkeypatch):
+    package = ROOT / "muvo_jax"
+    written = {".".join(path.relative_to(package).with_suffix("").parts).removesuffix(".__main__")
+               for path in package.rglob("*.py") if "command_line.run(" in path.read_text(encoding="utf-8")}
+    assert written == set(listing.COMMANDS)
+    monkeypatch.setattr(sys, "argv", ["muvo_jax"])
+    assert listing.main() == 0
+    lines = capsys.readouterr().out.splitlines()
+    for command in listing.COMMANDS:
+        assert sum(line.startswith(f"  python -m muvo_jax.{command} ") for line in lines) == 1
+
+
+def test_a_command_as_argument_is_told_how_it_is_called(capsys, monkeypatch):
+    monkeypatch.setattr(sys, "argv", ["muvo_jax", "trian"])
+    assert listing.main() == 2
+    assert "did you mean python -m muvo_jax.train?" in capsys.readouterr().err
 
 
 def test_an_unknown_option_names_its_neighbours(capsys):
@@ -112,6 +139,12 @@ def test_variant_flags_choose_encoders_fusion_latent_and_heads():
     assert model.heads == ("image", "range_view", "action")
     model = train.configure(train.Options(preset="paper", occupancy=True, backbone="mobilevitv2_100"))[0].model
     assert (model.heads, model.backbone) == (config_lib.HEADS, "mobilevitv2_100")
+    model = train.configure(train.Options(preset="tiny", heads="action,image", with_heads="range_view"))[0].model
+    assert model.heads == ("image", "range_view", "action")
+    for options, message in ((train.Options(heads="image,deph"), "--heads: 'deph' is unknown"),
+                             (train.Options(with_heads="occupancy", no_occupancy=True), "contradict each other")):
+        with pytest.raises(ValueError, match=message):
+            train.configure(options)
     model = train.configure(train.Options(preset="reference-2d", fusion="avg"))[0].model
     assert (model.variant, model.latent) == ("RV-WOB-AVG", "1d")
 
@@ -171,3 +204,9 @@ def test_the_whole_job_on_the_smallest_town(tmp_path):
                      XDG_CACHE_HOME=str(tmp_path / "cache"))
     assert again.returncode == 0, again.stderr
     assert list((tmp_path / "out").glob("*.gif"))
+    (code,) = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(encoding="utf-8"), re.DOTALL)
+    code = code.replace("town-tr", "tiny-tr") + "\nprint(predictions['image'][1].shape)"
+    readme = subprocess.run([sys.executable, "-c", code],
+                            cwd=tmp_path, capture_output=True, text=True, check=False,
+                            env={**os.environ, "PYTHONPATH": str(ROOT), "XDG_CACHE_HOME": str(tmp_path / "cache")})
+    assert readme.stdout.split() == ["(2,", "1,", "32,", "64,", "3)"], readme.stderr

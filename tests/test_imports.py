@@ -10,12 +10,13 @@ import pytest
 import muvo_jax
 
 PACKAGE = pathlib.Path(muvo_jax.__file__).parent
-BASE = {"types", "config", "config_json", "geometry", "ops"}
+BASE = {"types", "config", "config_heads", "config_json", "geometry", "ops"}
 ALLOWED = {
     "types": set(),
+    "config_heads": set(),
     "config_json": set(),
     "geometry": set(),
-    "config": {"config_json", "geometry"},
+    "config": {"config_heads", "config_json", "geometry"},
     "presets": {"config"},
     "ops": {"types", "config", "geometry"},
     "nn": BASE,
@@ -67,6 +68,6 @@ def test_importing_the_library_loads_no_checkpoint_data_or_plotting_code():
 def test_public_names_are_these():
     assert sorted(muvo_jax.__all__) == [
         "Batch", "Config", "Dream", "Gaussian", "LatentState", "LiveState", "ModelConfig", "Observed", "WorldModel",
-        "decode", "imagine", "load", "observe", "observe_step", "presets", "start_live",
+        "decode", "imagine", "load", "observe", "observe_step", "presets", "start_live", "windows",
     ]
     assert all(getattr(muvo_jax, name) is not None for name in muvo_jax.__all__)

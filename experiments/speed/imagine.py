@@ -1,32 +1,23 @@
-"""Speed of imagination, as ratios within one run: python experiments/speed/imagine.py [--branches=256]
+"""Speed and memory of imagination (1D latent, paper size), in processor seconds: python experiments/speed/imagine.py
 
-Compares `imagine` (1D latent, paper size) with the same matrix products alone in jitted JAX, and looks at its time over
-horizon and branches and at its first call (compilation) over the horizon.
+`imagine` beside its matrix products alone in jitted JAX; its time over horizon and branches; what compiling takes over
+the horizon; its memory beside what decoding would need; what decoding a chosen hundredth of the steps costs.
 """
 
 import argparse
+import dataclasses
 import time
 
 import jax
 import jax.numpy as jnp
+import timing
 
 import muvo_jax
 from muvo_jax import presets
 
 
-def seconds(function, *arguments, repeats=3):
-    """Best of several calls, compilation left out."""
-    jax.block_until_ready(function(*arguments))
-    times = []
-    for _ in range(repeats):
-        start = time.perf_counter()
-        jax.block_until_ready(function(*arguments))
-        times.append(time.perf_counter() - start)
-    return min(times)
-
-
-def products_alone(config, variables, batch, horizon):
-    """The matrix products of `horizon` prior steps [batch, ...], one after the other and nothing else."""
+def products_alone(variables, batch, horizon):
+    """(function, operations): the matrix products of `horizon` prior steps [batch, ...] and nothing else."""
     kernels = [leaf for name in ("pre_gru", "gru", "prior")
                for leaf in jax.tree.leaves(variables["params"]["transition"][name]) if leaf.ndim == 2]
 
@@ -39,37 +30,76 @@ def products_alone(config, variables, batch, horizon):
         return jax.lax.scan(step, jnp.float32(0), None, length=horizon)
 
     inputs = [jax.random.normal(jax.random.key(0), (batch, kernel.shape[0])) for kernel in kernels]
-    products = sum(2 * batch * kernel.size for kernel in kernels) * horizon
-    return (lambda: run(kernels, inputs)), products
+    return lambda: run(kernels, inputs), sum(2 * batch * kernel.size for kernel in kernels) * horizon
+
+
+def program(model, branches, horizon):
+    """`imagine`, lowered for `branches` futures of one state."""
+    shapes = jax.eval_shape(lambda: (jax.random.key(0), model.initial_state(1), jnp.zeros((1, horizon, 2))))
+    run = jax.jit(lambda variables, key, state, actions: muvo_jax.imagine(model, variables, key, state, actions,
+                                                                          branches=branches))
+    return run.lower(model.variable_shapes(), *shapes)
+
+
+def times(model, options):
+    variables = jax.tree.map(jnp.asarray, model.init(jax.random.key(0)))
+    state = model.initial_state(1)
+    imagine = lambda branches, horizon: lambda: muvo_jax.imagine(
+        model, variables, jax.random.key(0), state, jnp.zeros((1, horizon, 2)), branches=branches)
+    branches, horizon = options.branches, options.horizon
+    alone, operations = products_alone(variables, branches, horizon)
+    sizes = [(branches, horizon), (branches, 2 * horizon), (branches, 4 * horizon), (2 * branches, horizon),
+             (4 * branches, horizon)]
+    taken = timing.processor_seconds({"alone": alone} | {size: imagine(*size) for size in sizes}, options.rounds)
+    first = taken[sizes[0]]
+    print(f"matrix products alone: {min(taken['alone']):.3f} s, {operations / min(taken['alone']) / 1e9:.0f} GFLOP "
+          f"a processor second; imagine reaches {1 / timing.ratio(first, taken['alone']):.0%} of their speed")
+    print("| branches | horizon | processor seconds | latent steps a processor second | times the first row |")
+    print("|---:|---:|---:|---:|---:|")
+    for size in sizes:
+        print(f"| {size[0]} | {size[1]} | {min(taken[size]):.3f} | {size[0] * size[1] / min(taken[size]):,.0f} | "
+              f"{timing.ratio(taken[size], first):.2f} |", flush=True)
+
+
+def compilation(model, options):
+    print("| horizon | processor seconds to trace and compile | memory while running (MB) | results (MB) |")
+    print("|---:|---:|---:|---:|")
+    for horizon in (options.horizon, 4 * options.horizon, 16 * options.horizon):
+        start = time.process_time()
+        compiled = program(model, options.branches, horizon).compile()
+        taken = time.process_time() - start
+        memory = compiled.memory_analysis()
+        print(f"| {horizon} | {taken:.2f} | {memory.temp_size_in_bytes / 1e6:.1f} | "
+              f"{memory.output_size_in_bytes / 1e6:.1f} |", flush=True)
+
+
+def decoding():
+    """Decoding some of 6,400 imagined images; the tiny model, since 6,400 of the paper's take minutes and gigabytes."""
+    model = muvo_jax.WorldModel(presets.get("tiny").model)
+    variables = jax.tree.map(jnp.asarray, model.init(jax.random.key(0)))
+    dream = muvo_jax.imagine(model, variables, jax.random.key(0), model.initial_state(64), jnp.zeros((64, 100, 2)))
+    decode = lambda states: lambda: muvo_jax.decode(model, variables, states, heads=("image",))
+    taken = timing.processor_seconds({"all": decode(dream.states), "part": decode(dream.states[:, 50])}, rounds=5)
+    print(f"decoding 1 % of 6,400 images takes {timing.ratio(taken['part'], taken['all']):.1%} of decoding all")
 
 
 def main():
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--branches", type=int, default=256)
     parser.add_argument("--horizon", type=int, default=15)
+    parser.add_argument("--rounds", type=int, default=5)
     options = parser.parse_args()
-    config = presets.get("paper").model
-    model = muvo_jax.WorldModel(config)
-    variables = jax.tree.map(jnp.asarray, model.init(jax.random.key(0)))
-    state = model.initial_state(1)
-
-    def imagine(branches, horizon):
-        actions = jnp.zeros((1, horizon, 2))
-        return lambda: muvo_jax.imagine(model, variables, jax.random.key(0), state, actions, branches=branches)
-
-    alone, operations = products_alone(config, variables, options.branches, options.horizon)
-    reference_s = seconds(alone)
-    for branches, horizon in ((options.branches, options.horizon), (options.branches, 2 * options.horizon),
-                              (2 * options.branches, options.horizon)):
-        start = time.perf_counter()
-        jax.block_until_ready(imagine(branches, horizon)())
-        first_s = time.perf_counter() - start
-        taken_s = seconds(imagine(branches, horizon))
-        print(f"imagine {branches} branches, {horizon} steps: {taken_s:.3f} s, "
-              f"{branches * horizon / taken_s:,.0f} latent steps/s, first call {first_s:.1f} s", flush=True)
-        if (branches, horizon) == (options.branches, options.horizon):
-            print(f"its matrix products alone: {reference_s:.3f} s ({operations / reference_s / 1e9:.0f} GFLOP/s); "
-                  f"imagine reaches {reference_s / taken_s:.0%}", flush=True)
+    jax.config.update("jax_enable_compilation_cache", False)  # compiling is measured
+    config = presets.get("paper-occupancy").model
+    whole = muvo_jax.WorldModel(config)
+    bare = muvo_jax.WorldModel(dataclasses.replace(config, heads=("action",)))
+    same = program(whole, options.branches, options.horizon).as_text() == program(
+        bare, options.branches, options.horizon).as_text()
+    print(f"the program of imagine with the heads {', '.join(config.heads)} and with the action's alone: "
+          f"{'the same' if same else 'DIFFERENT'}")
+    compilation(bare, options)
+    times(bare, options)
+    decoding()
 
 
 if __name__ == "__main__":

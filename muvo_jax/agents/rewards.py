@@ -47,7 +47,8 @@ class RewardConfig:
     Attributes:
       progress: per metre along the route, divided by the metres of a step at `speed_limit_mps`.
       collision: times the collision probability.
-      comfort, speeding: times the respective penalty.
+      comfort, speeding: times the respective penalty. The limit is the best speed where speeding exceeds progress; at
+        twice progress a metre per second too fast costs what one too slow costs.
       terminal_collision: an imagined drive ends where the collision probability exceeds this; above 1 it never ends.
       route_tolerance_m: sigma of the decay with distance from the route.
       speed_limit_mps: what counts as fast.
@@ -58,7 +59,7 @@ class RewardConfig:
     progress: float = 1.0
     collision: float = 5.0
     comfort: float = 0.05
-    speeding: float = 0.5
+    speeding: float = 2.0
     terminal_collision: float = 0.5
     route_tolerance_m: float = 2.0
     speed_limit_mps: float = 10.0

@@ -27,9 +27,9 @@ _MAP_WEIGHT = 0.1  # of every term of a map, divided by the scale
 _INSTANCE_WEIGHT, _CENTRE_WEIGHT, _OFFSET_WEIGHT = 0.5, 200.0, 0.1
 _SIMILARITY_WEIGHT = {"1d": 0.6, "2d": 0.3}
 # Cross-entropies: weights of the classes, and the share of each frame's pixels, the worst ones, that counts.
-_BIRDVIEW = {"weights": losses.SEGMENTATION_WEIGHTS, "top_share": 0.25}
-_LIDAR_CLASSES = {"weights": losses.VOXEL_WEIGHTS, "top_share": 0.5}
-_IMAGE_CLASSES = {"weights": losses.VOXEL_WEIGHTS}
+_BIRDVIEW: dict[str, Any] = {"weights": losses.SEGMENTATION_WEIGHTS, "top_share": 0.25}
+_LIDAR_CLASSES: dict[str, Any] = {"weights": losses.VOXEL_WEIGHTS, "top_share": 0.5}
+_IMAGE_CLASSES: dict[str, Any] = {"weights": losses.VOXEL_WEIGHTS}
 _FRAMES = 2
 _IMAGE, _RANGE, _CELLS, _GRID = (320, 832), raw_batch.RANGE_SIZE, (192, 192), raw_batch.VOXEL_SHAPE
 # Prediction -> channels, full size, kind.
@@ -73,8 +73,8 @@ def _latent_and_action(context: cases.Context, action: np.ndarray) -> Terms:
     divergence = kl.balanced_kl_sums(posterior, prior, balance=_KL_BALANCE, numerics="reference")
     yield "probabilistic", _KL_WEIGHT * divergence.value()
     for column, (name, drawn) in enumerate((("throttle_brake", "o_tb"), ("steering", "o_st"))):
-        driven = context.draw(drawn, (1, _FRAMES, 1), "pm1")
-        yield name, regression.l1_sums(driven, action[..., column:column + 1]).value()
+        driven = jnp.asarray(context.draw(drawn, (1, _FRAMES, 1), "pm1"))
+        yield name, regression.l1_sums(driven, jnp.asarray(action[..., column:column + 1])).value()
 
 
 def _maps(context: cases.Context, labels: dict[str, np.ndarray], scale: int, line: str) -> Terms:
@@ -86,40 +86,49 @@ def _maps(context: cases.Context, labels: dict[str, np.ndarray], scale: int, lin
         small = tuple(side // scale for side in size)
         return context.draw(f"o_{name}_{scale}", (1, _FRAMES, channels, *small), kind)
 
-    last = lambda array: np.moveaxis(array, 2, -1)
     rgb, target = output("rgb"), labels[f"rgb_label_{scale}"]
-    of_instances = regression.l1_sums(last(rgb), last(target), labels[f"image_instance_mask_{scale}"][:, :, 0] > 0)
-    everywhere = regression.l1_sums(last(rgb), last(target))
+    of_instances = regression.l1_sums(_last(rgb), _last(target), _true(labels[f"image_instance_mask_{scale}"]))
+    everywhere = regression.l1_sums(_last(rgb), _last(target))
     yield "rgb", weight * (everywhere.value() + _INSTANCE_WEIGHT * of_instances.value())
-    flat = [last(picture).reshape(_FRAMES, *picture.shape[3:], 3) for picture in (rgb, target)]
+    flat = [_last(picture).reshape(_FRAMES, *picture.shape[3:], 3) for picture in (rgb, target)]
     yield "ssim", weight * _SIMILARITY_WEIGHT[line] * (1.0 - jax.jit(reference_losses.ssim)(*flat))
     if line == "2d":
         yield "perceptual", weight * _perceptual(rgb, target)
-    view, returns = last(output("lidar_reconstruction")), last(labels[f"range_view_label_{scale}"])
+    view, returns = _last(output("lidar_reconstruction")), _last(labels[f"range_view_label_{scale}"])
     yield "lidar_re", weight * regression.l2_sums(view[..., :3], returns[..., :3]).value()
     yield "lidar_depth", weight * regression.l1_sums(view[..., 3:], returns[..., 3:]).value()
     for name, drawn, label, options in (
             ("lidar_seg", "lidar_segmentation", "range_view_seg_label", _LIDAR_CLASSES),
             ("semantic_image", "semantic_image", "semantic_image_label", _IMAGE_CLASSES),
             ("bev_segmentation", "bev_segmentation", "birdview_label", _BIRDVIEW)):
-        logits, classes = losses.flat_frames(jnp.asarray(output(drawn)), labels[f"{label}_{scale}"])
-        yield name, weight * reference_losses.cross_entropy(logits, jnp.asarray(classes), **options)
-    yield "depth", weight * regression.l1_sums(last(output("depth")), last(labels[f"depth_label_{scale}"])).value()
+        logits, classes = losses.flat_frames(jnp.asarray(output(drawn)), jnp.asarray(labels[f"{label}_{scale}"]))
+        yield name, weight * reference_losses.cross_entropy(logits, classes, **options)
+    yield "depth", weight * regression.l1_sums(_last(output("depth")), _last(labels[f"depth_label_{scale}"])).value()
     yield from _instances(output, labels, scale)
-    yield from _occupancy(2 * last(output("voxel")), labels[f"voxel_label_{scale}"][:, :, 0], weight, line)
+    yield from _occupancy(2 * _last(output("voxel")), labels[f"voxel_label_{scale}"][:, :, 0], weight, line)
+
+
+def _last(array: np.ndarray) -> jax.Array:
+    """Channels last."""
+    return jnp.asarray(np.moveaxis(array, 2, -1))
+
+
+def _true(mask: np.ndarray) -> jax.Array:
+    """bool [B, S, 1, H, W] (or numbers) -> [B, S, H, W]"""
+    return jnp.asarray(mask[:, :, 0] > 0)
 
 
 def _instances(output, labels: dict[str, np.ndarray], scale: int) -> Terms:
     """Centres of instances, and the way to them, which only counts on an instance and not less at a smaller scale."""
-    last = lambda array: np.moveaxis(array, 2, -1)
-    centre = regression.l2_sums(last(output("bev_instance_center")), last(labels[f"center_label_{scale}"]))
+    centre = regression.l2_sums(_last(output("bev_instance_center")), _last(labels[f"center_label_{scale}"]))
     yield "bev_center", _MAP_WEIGHT / scale * _CENTRE_WEIGHT * centre.value()
     offset = labels[f"offset_label_{scale}"]
-    away = regression.l1_sums(last(output("bev_instance_offset")), last(offset), offset[:, :, 0] != preprocess.IGNORED)
+    away = regression.l1_sums(_last(output("bev_instance_offset")), _last(offset),
+                              _true(offset[:, :, :1] != preprocess.IGNORED))
     yield "bev_offset", _MAP_WEIGHT * _OFFSET_WEIGHT * away.value()
 
 
-def _occupancy(logits: np.ndarray, target: np.ndarray, weight: float, line: str) -> Terms:
+def _occupancy(logits: jax.Array, target: np.ndarray, weight: float, line: str) -> Terms:
     sums = jax.jit(scal.occupancy_sums)(logits, target)
     yield "geo_scal", weight * scal.geometric_scal(sums)
     if line == "1d":

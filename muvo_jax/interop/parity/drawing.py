@@ -51,8 +51,8 @@ def rounded_anew(variables: Any, tries: int = 32) -> Iterator[Any]:
     """The variables as rounding could have left them: times 1 + 1e-7 N(0, 1), as the packs' noise was measured."""
     for seed in range(tries):
         random = np.random.default_rng(seed)
-        move = lambda leaf, random=random: np.asarray(leaf * (1.0 + 1e-7 * random.standard_normal(leaf.shape)), np.float32)
-        yield jax.tree.map(move, variables)
+        noise = jax.tree.map(lambda leaf, random=random: 1e-7 * random.standard_normal(leaf.shape), variables)
+        yield jax.tree.map(lambda leaf, part: np.asarray(leaf * (1.0 + part), np.float32), variables, noise)
 
 
 def run(module, *args, prefix: str = "", where: str = "", rename: Callable[[str], str] | None = None,

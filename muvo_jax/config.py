@@ -5,20 +5,19 @@ from __future__ import annotations
 import dataclasses
 from typing import Any, Literal
 
+from muvo_jax.config_heads import ALL_HEADS, BIRDS_EYE_CLASSES, HEADS, TARGETS, LossConfig
 from muvo_jax.config_json import check_choice, override, override_all, parse
 from muvo_jax.geometry import BirdsEyeGrid, PillarGrid, RangeViewGeometry, VoxelGrid
 
-__all__ = ["ActionContract", "BirdsEyeGrid", "Config", "DataConfig", "EvaluationConfig", "LossConfig", "ModelConfig",
-           "OptimizerConfig", "PillarGrid", "RangeViewGeometry", "TrainConfig", "VoxelGrid", "override", "override_all",
-           "parse"]
+__all__ = ["ALL_HEADS", "BIRDS_EYE_CLASSES", "HEADS", "TARGETS", "ActionContract", "BirdsEyeGrid", "Config",
+           "DataConfig", "EvaluationConfig", "LossConfig", "ModelConfig", "OptimizerConfig", "PillarGrid",
+           "RangeViewGeometry", "TrainConfig", "VoxelGrid", "override", "override_all", "parse"]
 
 FUSIONS = ("tr", "fc", "avg")
 LIDAR_ENCODERS = ("rv", "pp")
 CAMERA_ENCODERS = ("wob", "bev")
 LATENTS = ("1d", "2d")
 BACKBONES = ("resnet18", "mobilevitv2_100")
-HEADS = ("image", "range_view", "occupancy", "action")
-ALL_HEADS = (*HEADS, "birds_eye")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -49,8 +48,8 @@ class ModelConfig:
     Attributes:
       fusion, lidar, camera, latent: the variant, see `variant`.
       numerics: "standard" follows the mathematics, "reference" the authors' code (DEVIATIONS.md lists the difference).
-      heads: what is decoded; a modality that the data lacks has no head. "birds_eye", classes and instances on the
-        ground plan of the voxels, is for converted models: no recording holds its targets.
+      heads: what is decoded, of config_heads.TARGETS; a modality that the data lacks has no head. "birds_eye", classes
+        and instances on the ground plan of the voxels, is for converted models: no recording holds its targets.
       route, speed: whether the planned route and the speed are inputs.
       navigation: whether the route's command, the next one and the GPS targets are inputs.
       backbone: of image and range view; pillars, route and the maps of fc and avg keep a ResNet-18.
@@ -126,6 +125,11 @@ class ModelConfig:
     speed_scale_mps: float = 5.0
 
     @property
+    def targets(self) -> dict[str, tuple[int, ...]]:
+        """What the loss terms of the heads compare with: Batch field -> its shape for one frame."""
+        return {field: shape for head in self.heads for field, shape in TARGETS[head](self).items()}
+
+    @property
     def variant(self) -> str:
         """The paper's name of the combination, such as RV-WOB-TR."""
         return f"{self.lidar}-{self.camera}-{self.fusion}".upper()
@@ -179,31 +183,6 @@ class ModelConfig:
                 raise ValueError(f"model.backbone=mobilevitv2_100 cuts its deepest maps into 2x2 patches: sides "
                                  f"{list(sides)} of image and range view must be multiples of 64. "
                                  f"Choose other sizes or model.backbone=resnet18.")
-
-
-@dataclasses.dataclass(frozen=True)
-class LossConfig:
-    """Weights of the loss terms (paper Eq. 1) at scale 1; scale f counts 1/f.
-
-    `image` (L1), `image_squared` (L2, an addition to the paper), `range_xyz`, `range_depth` and `occupancy_*` apply per
-    scale; 0 switches a term off. The Chamfer term looks at `chamfer_points` returns of each side; a predicted return is
-    a predicted range above `return_threshold_m`.
-    """
-
-    image: float = 0.1
-    image_squared: float = 0.0
-    range_xyz: float = 0.1
-    range_depth: float = 0.1
-    occupancy_cross_entropy: float = 0.1
-    occupancy_semantic_scal: float = 0.1
-    occupancy_geometric_scal: float = 0.1
-    chamfer: float = 0.0
-    action: float = 1.0
-    kl: float = 1e-3
-    kl_balance: float = 0.75
-    chamfer_points: int = 1024
-    return_threshold_m: float = 1.0
-    occupancy_unknown: Literal["ignore", "empty"] = "ignore"
 
 
 @dataclasses.dataclass(frozen=True)

@@ -13,7 +13,7 @@ from typing import Annotated, Any
 import numpy as np
 import tyro
 
-from muvo_jax import command_line, dream, evaluate, presets
+from muvo_jax import command_line, config_json, dream, evaluate, presets
 from muvo_jax import config as config_lib
 from muvo_jax.training import checkpoint, loop, run_folder, screen, validation
 from muvo_jax.viz import curves, sheets
@@ -50,6 +50,10 @@ class Options:
     """The latent state: 1d (vectors) or 2d (tokens, only with fusion tr)."""
     backbone: Annotated[str | None, command_line.shown("{resnet18,mobilevitv2_100}")] = None
     """Of image and range view."""
+    heads: Annotated[str | None, command_line.shown("NAME,...")] = None
+    """What is predicted, exactly: of image, range_view, occupancy, action and the optional heads (docs/variants.md)."""
+    with_heads: Annotated[str | None, command_line.shown("NAME,...", "none")] = None
+    """Heads beside those of the preset."""
     occupancy: tyro.conf.FlagCreatePairsOff[bool] = False
     """Predict occupancy, whatever the preset says."""
     no_occupancy: tyro.conf.FlagCreatePairsOff[bool] = False
@@ -124,8 +128,9 @@ def configure(options: Options) -> tuple[config_lib.Config, dict[str, Any], path
                              f"--preset away, or start another run with --name.")
     elif options.init:
         base = dataclasses.replace(base, model=checkpoint.load_run(options.init).config.model)
-    if options.occupancy or options.no_occupancy:
-        chosen["model.heads"] = _heads(options, chosen.get("model.heads", base.model.heads))
+    heads = _heads(options, chosen.get("model.heads", base.model.heads))
+    if heads is not None:
+        chosen["model.heads"] = heads
     if chosen.get("model.fusion", "tr") != "tr" and base.model.latent == "2d":
         chosen.setdefault("model.latent", "1d")  # the only one that such a fusion has
     base = config_lib.override_all(base, chosen)
@@ -154,11 +159,23 @@ def _variant_settings(options: Options) -> dict[str, str]:
     return {f"model.{flag}": value for flag, value in parts.items()}
 
 
-def _heads(options: Options, heads: Sequence[str]) -> tuple[str, ...]:
-    """The heads with or without occupancy, as the flags say."""
-    if options.occupancy and options.no_occupancy:
-        raise ValueError("--occupancy and --no-occupancy contradict each other: give one of them.")
-    wanted = {*heads, "occupancy"} if options.occupancy else set(heads) - {"occupancy"}
+def _heads(options: Options, heads: Sequence[str]) -> tuple[str, ...] | None:
+    """The heads that the flags make of those of the preset, None where no flag speaks of heads.
+
+    Raises:
+      ValueError: for a head that does not exist, or flags that contradict each other.
+    """
+    if (options.heads, options.with_heads, options.occupancy, options.no_occupancy) == (None, None, False, False):
+        return None
+    exact, more = (text.split(",") if text else [] for text in (options.heads, options.with_heads))
+    for flag, names in (("--heads", exact), ("--with-heads", more)):
+        for name in names:
+            config_json.check_choice(flag, name, config_lib.ALL_HEADS)
+    if options.no_occupancy and (options.occupancy or "occupancy" in exact + more):
+        raise ValueError("--no-occupancy and --occupancy (or --heads and --with-heads with occupancy) contradict each "
+                         "other: give one of them.")
+    wanted = {*(exact or heads), *more} | ({"occupancy"} if options.occupancy else set())
+    wanted -= {"occupancy"} if options.no_occupancy else set()
     return tuple(head for head in config_lib.ALL_HEADS if head in wanted)
 
 

@@ -112,6 +112,12 @@ def test_variant_flags_choose_encoders_fusion_latent_and_heads():
     assert model.heads == ("image", "range_view", "action")
     model = train.configure(train.Options(preset="paper", occupancy=True, backbone="mobilevitv2_100"))[0].model
     assert (model.heads, model.backbone) == (config_lib.HEADS, "mobilevitv2_100")
+    model = train.configure(train.Options(preset="tiny", heads="action,image", with_heads="range_view"))[0].model
+    assert model.heads == ("image", "range_view", "action")
+    for options, message in ((train.Options(heads="image,deph"), "--heads: 'deph' is unknown"),
+                             (train.Options(with_heads="occupancy", no_occupancy=True), "contradict each other")):
+        with pytest.raises(ValueError, match=message):
+            train.configure(options)
     model = train.configure(train.Options(preset="reference-2d", fusion="avg"))[0].model
     assert (model.variant, model.latent) == ("RV-WOB-AVG", "1d")
 

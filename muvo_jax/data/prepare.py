@@ -24,6 +24,8 @@ SHORT_RECORDING_FRAMES = 100
 # What a short recording is cut into: 0.4 s observed and 0.4 s imagined at 10 Hz.
 _SHORT = {"stride": 1, "context": 4, "horizon": 4, "frames": 8}
 _SIDE_MULTIPLE = 32
+# Targets that every recording has, or that are made of what it has; the others it must hold itself.
+_ALWAYS_THERE = frozenset({"image", "range_view", "occupancy", "action"})
 NAVIGATION = ("command", "next_command", "target_m", "next_target_m")
 
 PreparedFrame = dict[str, np.ndarray | np.generic]  # names and dtypes of types.Batch without B and T
@@ -88,10 +90,19 @@ def prepare_frame(raw: schema.RawFrame, config: config_lib.Config) -> PreparedFr
         ready["route_map"] = raw["route_map"]
     if model.speed:
         ready["speed_mps"] = raw["speed_mps"]
-    for name in ("reward", "is_terminal"):
+    for name in ("reward", "is_terminal", *(model.targets.keys() - _ALWAYS_THERE)):
         if name in raw:
-            ready[name] = raw[name]
+            ready[name] = raw[name]  # type: ignore[literal-required]
     return ready
+
+
+def check_targets(model: config_lib.ModelConfig, description: schema.RecordingDescription) -> None:
+    """Raises DataError where a head cannot be trained: names the head, what the recording lacks, and the way out."""
+    for head in model.heads:
+        for field in config_lib.TARGETS[head](model).keys() - _ALWAYS_THERE - description.modalities:
+            others = ",".join(name for name in model.heads if name != head)
+            raise schema.DataError(f"head {head!r} learns from {field}, which recording {description.name!r} does not "
+                                   f"hold. Leave the head out (--heads={others}), or record {field}.")
 
 
 def padded_points(points_m: np.ndarray, rows: int, seed: int) -> tuple[np.ndarray, np.int32]:

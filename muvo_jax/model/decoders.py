@@ -149,3 +149,14 @@ class ActionDecoder(linen.Module):
         return {1: jnp.tanh(out.astype(jnp.float32))}
 
 
+class VectorDecoder(linen.Module):
+    """Features -> [N, channels] at scale 1: a perceptron with two hidden layers, no output activation."""
+
+    channels: int
+    width: int
+    compute: layers.Compute = layers.Compute()
+
+    @linen.compact
+    def __call__(self, features: jax.Array) -> dict[int, jax.Array]:
+        out = layers.Mlp((self.width, self.width, self.channels), self.compute, name="mlp")(features)
+        return {1: out.astype(jnp.float32)}

@@ -15,6 +15,8 @@ sample instead of per batch.
 
 from __future__ import annotations
 
+import abc
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -46,33 +48,33 @@ def where(condition: jax.Array, chosen: jax.Array, other: jax.Array) -> jax.Arra
     return jnp.where(spread, chosen, other)
 
 
-class Transition(linen.Module):
+class Transition(linen.Module, abc.ABC):
     """The interface of muvo_jax.model.transition.REGISTRY, over states [B, ...]."""
 
     config: ModelConfig
 
     @staticmethod
+    @abc.abstractmethod
     def state_shapes(config: ModelConfig) -> tuple[tuple[int, ...], tuple[int, ...]]:
         """Shapes of the deterministic and of the stochastic state of one sample."""
-        raise NotImplementedError
 
     @staticmethod
+    @abc.abstractmethod
     def initial_constants(config: ModelConfig) -> dict[str, np.ndarray]:
         """Path of a parameter below "transition" -> its first value."""
-        raise NotImplementedError
 
+    @abc.abstractmethod
     def recur(self, state: LatentState) -> jax.Array:
         """The next deterministic state."""
-        raise NotImplementedError
 
+    @abc.abstractmethod
     def predict(self, deterministic: jax.Array, action: jax.Array, keys: jax.Array | None) -> Gaussian:
         """The prior; keys [B] switch dropout on."""
-        raise NotImplementedError
 
+    @abc.abstractmethod
     def infer(self, deterministic: jax.Array, embedding: jax.Array, action: jax.Array,
               keys: jax.Array | None) -> Gaussian:
         """The posterior; keys [B] switch dropout on."""
-        raise NotImplementedError
 
     @classmethod
     def initial_state(cls, config: ModelConfig, batch_size: int) -> LatentState:

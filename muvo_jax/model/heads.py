@@ -1,4 +1,7 @@
-"""The one table of what is decoded: a head's name, its decoder, channels, scales, tokens, unit and first guess."""
+"""The one table of what is decoded: a head's name, its decoder, channels, scales, tokens, unit and first guess.
+
+config_heads.py says what a head is compared with, objectives/terms.py how, and what a new head takes.
+"""
 
 from __future__ import annotations
 
@@ -7,10 +10,8 @@ from collections.abc import Callable
 
 from flax import linen
 
-from muvo_jax.config import ModelConfig
+from muvo_jax.config import BIRDS_EYE_CLASSES, ModelConfig
 from muvo_jax.model import common, decoders, outputs, token_decoders, tokens
-
-BIRDS_EYE_CLASSES = 8
 
 
 @dataclasses.dataclass(frozen=True)
@@ -21,7 +22,8 @@ class Head:
       build: makes the decoder module, given the model's configuration and the channels.
       channels: of each output.
       scales: what the decoder returns; 1 is full size.
-      tokens: which group of the 2D latent the decoder reads (muvo_jax.model.tokens); with the 1D latent it reads all.
+      tokens: which group of the 2D latent the decoder reads (muvo_jax.model.tokens), None for one vector of all groups
+        (tokens.pool); with the 1D latent it reads all features.
       unit: factor from the network's output to the prediction (the range view comes out in metres).
       initial_bias: bias of the last layers of a fresh model, the network's first guess.
     """
@@ -29,7 +31,7 @@ class Head:
     build: Callable[[ModelConfig, int], linen.Module]
     channels: int
     scales: tuple[int, ...]
-    tokens: str
+    tokens: str | None
     unit: Callable[[ModelConfig], float] = lambda config: 1.0
     initial_bias: float | None = None
 
@@ -72,6 +74,11 @@ def _birds_eye(config: ModelConfig, channels: int) -> linen.Module:
 def _action(config: ModelConfig, channels: int) -> linen.Module:
     del channels
     return decoders.ActionDecoder(common.compute(config))
+
+
+def _vector(config: ModelConfig, channels: int) -> linen.Module:
+    """A few numbers, without an output activation: reward, motion and the like."""
+    return decoders.VectorDecoder(channels, config.decoder_channels, common.compute(config))
 
 
 TABLE = {

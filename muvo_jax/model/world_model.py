@@ -76,8 +76,11 @@ class Network(linen.Module):
         return raw
 
     def read(self, features: jax.Array, head: str) -> jax.Array:
-        """The part of the features that a head decodes: its group of tokens with the 2D latent."""
-        return tokens.read(features, heads.TABLE[head].tokens, self.config) if self.config.latent == "2d" else features
+        """What a head decodes of the features: with the 2D latent its group of tokens, or all of them pooled."""
+        if self.config.latent == "1d":
+            return features
+        group = heads.TABLE[head].tokens
+        return tokens.pool(features, self.config) if group is None else tokens.read(features, group, self.config)
 
     def everything(self, frames: dict[str, jax.Array], noise: StepNoise, action: jax.Array, state: LatentState,
                    is_first: jax.Array) -> Predictions:
@@ -210,7 +213,8 @@ class WorldModel:
 
         Returns:
           head -> scale -> float32 [..., *size / scale, channels]: image in [0, 1] where trained (no clipping),
-          range_view in metres, occupancy as logits [..., X, Y, Z, 2], action in (-1, 1) [..., 2] at scale 1.
+          range_view in metres, occupancy as logits [..., X, Y, Z, 2], action in (-1, 1) [..., 2] at scale 1; what other
+          heads return, model/heads.py says.
 
         Raises:
           ValueError: for a head that the model does not have, or features of another shape.

@@ -99,13 +99,27 @@ class Attention(linen.Module):
         return layers.Dense(channels, self.compute, name="out_proj")(mixed.reshape(count, length, channels))
 
 
-class EncoderLayer(linen.Module):
-    """Post-norm layer: x = norm(x + attention(x)), x = norm(x + feed-forward(x)), ReLU inside."""
+class _Layer(linen.Module):
+    """What a layer of either transformer is told."""
 
     heads: int
     hidden_channels: int
     dropout_rate: float
     compute: layers.Compute = layers.Compute()
+
+
+class _Stack(linen.Module):
+    """What either transformer is told: the number of its layers and what they are told."""
+
+    layers_count: int
+    heads: int
+    hidden_channels: int
+    dropout_rate: float
+    compute: layers.Compute = layers.Compute()
+
+
+class EncoderLayer(_Layer):
+    """Post-norm layer: x = norm(x + attention(x)), x = norm(x + feed-forward(x)), ReLU inside."""
 
     @linen.compact
     def __call__(self, x: jax.Array, keys: jax.Array | None, first_site: int) -> jax.Array:
@@ -120,17 +134,11 @@ class EncoderLayer(linen.Module):
 SITES_PER_LAYER = 4
 
 
-class TransformerEncoder(linen.Module):
+class TransformerEncoder(_Stack):
     """A stack of encoder layers over tokens [N, L, C], no mask and no final norm.
 
     A plain loop: stacked parameters (scan) would turn biases into matrices, which weight decay tells apart.
     """
-
-    layers_count: int
-    heads: int
-    hidden_channels: int
-    dropout_rate: float
-    compute: layers.Compute = layers.Compute()
 
     @linen.compact
     def __call__(self, x: jax.Array, keys: jax.Array | None = None) -> jax.Array:
@@ -140,13 +148,8 @@ class TransformerEncoder(linen.Module):
         return x
 
 
-class DecoderLayer(linen.Module):
+class DecoderLayer(_Layer):
     """Post-norm layer over x and a memory: self-attention, attention on the memory, feed-forward with ReLU inside."""
-
-    heads: int
-    hidden_channels: int
-    dropout_rate: float
-    compute: layers.Compute = layers.Compute()
 
     @linen.compact
     def __call__(self, x: jax.Array, memory: jax.Array, keys: jax.Array | None,
@@ -163,7 +166,7 @@ class DecoderLayer(linen.Module):
 SITES_PER_DECODER_LAYER = 6
 
 
-class TransformerDecoder(linen.Module):
+class TransformerDecoder(_Stack):
     """A stack of decoder layers over tokens x [N, L, C] and a memory [N, M, C], no mask and no final norm.
 
     The backward pass computes each layer anew: the weights of a layer at the paper's size, [N, 8, 1093, 1612], with
@@ -171,12 +174,6 @@ class TransformerDecoder(linen.Module):
     moves what a plain loop computes anew to the front, all layers at once. Its stack of parameters is made on the way:
     a tree of stacked ones would turn biases into matrices, which weight decay tells apart.
     """
-
-    layers_count: int
-    heads: int
-    hidden_channels: int
-    dropout_rate: float
-    compute: layers.Compute = layers.Compute()
 
     @linen.compact
     def __call__(self, x: jax.Array, memory: jax.Array, keys: jax.Array | None = None,

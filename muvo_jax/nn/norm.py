@@ -77,6 +77,13 @@ def batch_moments(x: jax.Array, axis_name: str | None,
     return mean, squares / count, squares / jnp.maximum(count - 1.0, 1.0)
 
 
+def _centred(x: jax.Array, axes: tuple[int, ...], epsilon: float) -> tuple[jax.Array, jax.Array]:
+    """x minus its mean over some axes, and 1 / sqrt(variance + epsilon) with those axes kept; float32."""
+    x32 = x.astype(jnp.float32)
+    centred = x32 - jnp.mean(x32, axis=axes, keepdims=True)
+    return centred, jax.lax.rsqrt(jnp.mean(jnp.square(centred), axis=axes, keepdims=True) + epsilon)
+
+
 class LayerNorm(linen.Module):
     """[..., C] normalised over the last axis, eps 1e-5."""
 
@@ -86,10 +93,8 @@ class LayerNorm(linen.Module):
     def __call__(self, x: jax.Array) -> jax.Array:
         scale = self.param("scale", layers.shape_only, (x.shape[-1],))
         bias = self.param("bias", layers.shape_only, (x.shape[-1],))
-        x32 = x.astype(jnp.float32)
-        centred = x32 - jnp.mean(x32, axis=-1, keepdims=True)
-        y = centred * jax.lax.rsqrt(jnp.mean(jnp.square(centred), axis=-1, keepdims=True) + self.epsilon)
-        y = y * layers.per_channel(scale, x.ndim) + layers.per_channel(bias, x.ndim)
+        centred, inverse_std = _centred(x, (-1,), self.epsilon)
+        y = centred * inverse_std * layers.per_channel(scale, x.ndim) + layers.per_channel(bias, x.ndim)
         return y.astype(x.dtype)
 
 
@@ -102,10 +107,9 @@ class SampleNorm(linen.Module):
     def __call__(self, x: jax.Array) -> jax.Array:
         scale = self.param("scale", layers.shape_only, (x.shape[-1],))
         bias = self.param("bias", layers.shape_only, (x.shape[-1],))
-        x32, axes = x.astype(jnp.float32), tuple(range(1, x.ndim))
-        centred = x32 - jnp.mean(x32, axis=axes, keepdims=True)
-        y = centred * jax.lax.rsqrt(jnp.mean(jnp.square(centred), axis=axes, keepdims=True) + self.epsilon)
-        return (y * layers.per_channel(scale, x.ndim) + layers.per_channel(bias, x.ndim)).astype(x.dtype)
+        centred, inverse_std = _centred(x, tuple(range(1, x.ndim)), self.epsilon)
+        y = centred * inverse_std * layers.per_channel(scale, x.ndim) + layers.per_channel(bias, x.ndim)
+        return y.astype(x.dtype)
 
 
 class AdaptiveInstanceNorm(linen.Module):
@@ -121,9 +125,6 @@ class AdaptiveInstanceNorm(linen.Module):
     def __call__(self, x: jax.Array, style: jax.Array) -> jax.Array:
         affine = layers.Dense(2 * x.shape[-1], self.compute, name="style")(style).astype(jnp.float32)
         scale, shift = jnp.split(affine, 2, axis=-1)
-        space = tuple(range(1, x.ndim - 1))
-        x32 = x.astype(jnp.float32)
-        centred = x32 - jnp.mean(x32, axis=space, keepdims=True)
-        inverse_std = jax.lax.rsqrt(jnp.mean(jnp.square(centred), axis=space, keepdims=True) + self.epsilon)
+        centred, inverse_std = _centred(x, tuple(range(1, x.ndim - 1)), self.epsilon)
         y = centred * (inverse_std * layers.spread(scale, x.ndim)) + layers.spread(shift, x.ndim)
         return y.astype(x.dtype)

@@ -19,6 +19,10 @@ class MeanSums:
         """The mean, 0 where nothing was counted (nothing to learn from is no loss; it must not be NaN)."""
         return self.total / jnp.maximum(self.count, 1.0)
 
+    def terms(self, name: str) -> dict[str, types.Array]:
+        """The loss terms that follow from the sums of the whole batch: this one mean."""
+        return {name: self.value()}
+
 
 def l1_sums(prediction: types.Array, target: types.Array, mask: types.Array | None = None) -> MeanSums:
     """Absolute error summed over channels, to be averaged over every other axis.

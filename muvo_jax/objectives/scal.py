@@ -39,6 +39,13 @@ class OccupancySums:
     true_empty: types.Array
     false_empty: types.Array
 
+    def terms(self, name: str) -> dict[str, types.Array]:
+        """The loss terms that follow from the sums of the whole batch; `name` ends in the scale."""
+        scale = name.rsplit("_", 1)[1]
+        return {f"occupancy_cross_entropy_{scale}": cross_entropy(self),
+                f"occupancy_semantic_scal_{scale}": semantic_scal(self),
+                f"occupancy_geometric_scal_{scale}": geometric_scal(self)}
+
 
 def occupancy_sums(logits: types.Array, target: types.Array, unknown_is_empty: bool = False) -> OccupancySums:
     """Sums over all voxels of a scale.

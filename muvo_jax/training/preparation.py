@@ -71,11 +71,11 @@ def expected_batch(config: config_lib.Config, windows: int, *, rewards: bool = T
     fields = {name: timed(types.BATCH_FIELDS[name][0], *sizes) for name, sizes in world_model.inputs(model).items()}
     fields["range_view"] = timed(np.float32, model.range_view.rows, model.range_view.columns, 4)
     fields |= {"intrinsics": shape(np.float32, 3, 3), "camera_to_ego": shape(np.float32, 4, 4)}
-    if "occupancy" in model.heads:
-        fields["occupancy"] = timed(np.uint8, *model.voxels.shape)
+    fields |= {name: timed(types.BATCH_FIELDS[name][0], *sizes) for name, sizes in model.targets.items()}
     if rewards:
         fields |= {"reward": timed(np.float32), "is_terminal": timed(np.bool_)}
-    return types.Batch(action=timed(np.float32, 2), is_first=timed(np.bool_), **fields)
+    fields["action"] = timed(np.float32, 2)
+    return types.Batch(is_first=timed(np.bool_), **fields)
 
 
 def shapes_of(batch: types.Batch) -> types.Batch:

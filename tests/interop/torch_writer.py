@@ -19,8 +19,9 @@ class _Global:
     def __init__(self, module, name):
         self.module, self.name = module, name
 
-    def __call__(self):  # pickle asks that what is called be callable
-        raise NotImplementedError
+    def __call__(self):
+        """What unpickling makes of it; pickle asks that the first part of a reduction be callable."""
+        return ForeignObject(self.module, self.name, None)
 
 
 class _Storage:

@@ -58,13 +58,13 @@ def test_parity_with_the_reference():
     keep = (golden_rule.make_input("ssc_mix2", shape, "uniform") < 0.7) & (truth != 255)
     prediction = np.where(keep, truth, golden_rule.make_input("ssc_pred2", shape, "voxel2")) == 1
     counts = occupancy.OccupancyCounts.zeros(3).add(prediction[None], truth[None], unknown_is_empty=False)
-    check_scores(golden["ssc_c2_batch1"], golden["ssc_c2_batch1_perclass"], counts)
+    assert_scores(golden["ssc_c2_batch1"], golden["ssc_c2_batch1_perclass"], counts)
     flipped = np.where(truth == 255, 0, truth)[:, ::-1]
     counts = counts.add(prediction[None, :, ::-1], flipped[None], unknown_is_empty=False)
-    check_scores(golden["ssc_c2_batch2"], golden["ssc_c2_batch2_perclass"], counts)
+    assert_scores(golden["ssc_c2_batch2"], golden["ssc_c2_batch2_perclass"], counts)
 
 
-def check_scores(golden, per_class, counts):
+def assert_scores(golden, per_class, counts):
     scores = counts.overall().scores()
     np.testing.assert_allclose([scores["precision"], scores["recall"], scores["iou_occ"]], golden[:3], rtol=1e-5)
     np.testing.assert_allclose([scores["iou_empty"], scores["iou_occ"]], per_class, rtol=1e-5)

@@ -78,7 +78,7 @@ def torch_layout(array, lead):
     return np.moveaxis(np.asarray(array), -1, lead)
 
 
-def check(source, errors, tolerance):
+def assert_parity(source, errors, tolerance):
     """Compares name -> array with the pack and asserts the tolerance, which may be given per name."""
     measured = {name: pack(source).error(name, np.asarray(value)) for name, value in errors.items()}
     for name, error in measured.items():
@@ -108,7 +108,7 @@ def test_backbones_and_necks():
     for index, value in enumerate(run(backbone, "lidar", "backbone", range_view)):
         out[f"range_view_encoder_resnet18/feat{index}"] = torch_layout(value, 1)
     out["DecoderDS/out"] = torch_layout(run(pyramid_lib.DownsamplingPyramid(384), "camera", "neck", pyramid), 1)
-    check(P3, out, {})
+    assert_parity(P3, out, {})
 
 
 def test_transformer_and_compression():
@@ -126,7 +126,7 @@ def test_transformer_and_compression():
         value = channels_last(make_input(f"{sensor}_feature_conv_in", (2, 384, *size), "normal"))
         weights = {"params": params[name], "batch_stats": stats[name]}
         out[f"{sensor}_feature_conv/out"] = fusion.Compression(512).apply(weights, value, EVAL)
-    check(P3, out, {})
+    assert_parity(P3, out, {})
 
 
 def test_measurements():
@@ -137,7 +137,7 @@ def test_measurements():
     (deepest,) = resnet.ResNet18(64, (4,)).apply({"params": params["backbone"], "batch_stats": stats["backbone"]},
                                                  route, EVAL)
     route_vector = layers.Dense(16).apply({"params": params["linear"]}, jnp.mean(deepest, axis=(1, 2)))
-    check(P3, {"speed_enc/out": call(lambda network, value: network.speed(value), speed_mps),
+    assert_parity(P3, {"speed_enc/out": call(lambda network, value: network.speed(value), speed_mps),
                "backbone_route/out": route_vector}, {})
 
 
@@ -150,7 +150,7 @@ def test_decoders():
         out[f"lidar_re/lidar_reconstruction_{scale}"] = torch_layout(full["range_view"][scale] / 50.0, 1)
         out[f"rgb_decoder/rgb_{scale}"] = torch_layout(one["image"][scale], 1)
         out[f"voxel_decoder/voxel_{scale}"] = torch_layout(one["occupancy"][scale], 1)
-    check(P3, out, {"voxel": 5e-4})
+    assert_parity(P3, out, {"voxel": 5e-4})
 
 
 @pytest.mark.parametrize("sampled", [False, True])
@@ -178,7 +178,7 @@ def test_recurrent_model(sampled):
         steps.append((state.deterministic, state.stochastic, prior.mean, prior.std))
     for name, *values in zip(("hidden_state", "sample", "mu", "sigma"), *steps, strict=True):
         out[f"{prefix}/imagine/{name}"] = np.stack(values, 1)
-    check(P3, out, {})
+    assert_parity(P3, out, {})
 
 
 P4 = "p4_full/1d_RV_WOB_TR_voxel.npz"
@@ -224,4 +224,4 @@ def test_full_model():
         out |= {f"{name}/hidden": dream.states.deterministic, f"{name}/sample": dream.states.stochastic,
                 f"{name}/state": dream.features, f"{name}/action": dream.actions}
         out |= head_entries(name, rollout.decode(MODEL, variables(), dream.states))
-    check(P4, out, {"voxel": 1e-3})
+    assert_parity(P4, out, {"voxel": 1e-3})

@@ -44,7 +44,7 @@ def actions():
     return jax.random.uniform(jax.random.key(3), (BATCH, HORIZON, 2), minval=-1.0)
 
 
-def close(first, second, tolerance=1e-5):
+def assert_close(first, second, tolerance=1e-5):
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=tolerance, rtol=1e-4), first, second)
 
 
@@ -53,7 +53,7 @@ def test_observe_shapes_and_determinism(variables):
     observed = rollout.observe(MODEL, variables, key, batch)
     assert observed.states.deterministic.shape == (BATCH, FRAMES, CONFIG.deterministic_channels)
     assert observed.prior.mean.shape == observed.posterior.std.shape == (BATCH, FRAMES, CONFIG.stochastic_channels)
-    close(observed, rollout.observe(MODEL, variables, key, batch), 0)
+    assert_close(observed, rollout.observe(MODEL, variables, key, batch), 0)
     other = rollout.observe(MODEL, variables, jax.random.key(6), batch)
     assert not np.allclose(observed.states.stochastic, other.states.stochastic)
 
@@ -61,7 +61,7 @@ def test_observe_shapes_and_determinism(variables):
 def test_mean_mode_ignores_the_key_and_returns_the_mean(variables, state, actions):
     batch = make_batch()
     first = rollout.observe(MODEL, variables, jax.random.key(5), batch, sampled=False)
-    close(first, rollout.observe(MODEL, variables, jax.random.key(6), batch, sampled=False), 0)
+    assert_close(first, rollout.observe(MODEL, variables, jax.random.key(6), batch, sampled=False), 0)
     np.testing.assert_array_equal(first.states.stochastic, first.posterior.mean)
     dream = rollout.imagine(MODEL, variables, jax.random.key(7), state, actions, sampled=False)
     np.testing.assert_array_equal(dream.states.stochastic, dream.prior.mean)
@@ -71,9 +71,9 @@ def test_a_samples_noise_depends_on_its_key_alone(variables):
     keys = jax.random.split(jax.random.key(8), BATCH)
     whole = rollout.observe(MODEL, variables, keys, make_batch())
     swapped = jax.tree.map(lambda leaf: leaf[::-1], make_batch())
-    close(rollout.observe(MODEL, variables, keys[::-1], swapped)[0], whole[1])
+    assert_close(rollout.observe(MODEL, variables, keys[::-1], swapped)[0], whole[1])
     noise = rollout.draw_noise(keys, 5, (3,), 0.5)
-    close(rollout.draw_noise(keys[1:], 2, (3,), 0.5), noise[1:, :2], 0)
+    assert_close(rollout.draw_noise(keys[1:], 2, (3,), 0.5), noise[1:, :2], 0)
 
 
 def test_noise_is_standard_normal_and_its_coin_fair():
@@ -92,15 +92,15 @@ def test_imagine_equals_a_loop_by_hand(variables, state, actions):
     current = state
     for step in range(HORIZON):
         current, prior = MODEL.imagine_step(variables, jnp.zeros_like(state.stochastic), actions[:, step], current)
-        close((dream.states[:, step], dream.prior[:, step]), (current, prior))
+        assert_close((dream.states[:, step], dream.prior[:, step]), (current, prior))
 
 
 def test_branches_are_independent_futures(variables, state, actions):
     fan = jnp.stack([actions, -actions, actions], axis=1)
     dream = rollout.imagine(MODEL, variables, jax.random.key(1), state, fan, sampled=False)
     assert dream.features.shape == (BATCH, 3, HORIZON, *MODEL.feature_shape)
-    close(dream[:, 0], dream[:, 2])
-    close(dream[:, 1], rollout.imagine(MODEL, variables, jax.random.key(1), state, -actions, sampled=False))
+    assert_close(dream[:, 0], dream[:, 2])
+    assert_close(dream[:, 1], rollout.imagine(MODEL, variables, jax.random.key(1), state, -actions, sampled=False))
     sampled = rollout.imagine(MODEL, variables, jax.random.key(1), state, actions, branches=3)
     assert sampled.states.stochastic.shape == (BATCH, 3, HORIZON, CONFIG.stochastic_channels)
     assert not np.allclose(sampled.states.stochastic[:, 0], sampled.states.stochastic[:, 1])
@@ -166,7 +166,7 @@ def test_training_windows_use_dropout_and_update_statistics(variables):
     window = jax.jit(rollout.observe_window, static_argnums=0, static_argnames=("train", "sampled"))
     first, stats = window(MODEL, variables, batch, keys, train=True, sampled=False)
     again, _ = window(MODEL, variables, batch, keys, train=True, sampled=False)
-    close(first, again, 0)
+    assert_close(first, again, 0)
     moved = jax.tree.map(lambda new, old: bool(np.abs(new - old).max() > 0), stats, variables["batch_stats"])
     assert all(jax.tree.leaves(moved))
     other, _ = window(MODEL, variables, batch, jax.random.split(jax.random.key(5), BATCH), train=True, sampled=False)
@@ -210,7 +210,7 @@ def test_a_dream_from_every_frame_is_the_dream_from_each(variables, actions):
     keys = jax.random.split(jax.random.key(6), (BATCH, HORIZON))
     dream = rollout.imagine(MODEL, variables, keys, observed.states, plans)
     assert dream.features.shape == (BATCH, HORIZON, HORIZON, *MODEL.feature_shape)
-    close(dream[:, 1], rollout.imagine(MODEL, variables, keys[:, 1], observed.states[:, 1], actions))
+    assert_close(dream[:, 1], rollout.imagine(MODEL, variables, keys[:, 1], observed.states[:, 1], actions))
     one = rollout.imagine(MODEL, variables, keys[0, 1], observed.states[0, 1], actions[0])
     assert one.actions.shape == (HORIZON, 2)
 
@@ -218,9 +218,9 @@ def test_a_dream_from_every_frame_is_the_dream_from_each(variables, actions):
 def test_temperature_and_shared_noise(variables, state, actions):
     fan = jnp.stack([actions, actions, -actions], axis=1)
     cold = rollout.imagine(MODEL, variables, jax.random.key(1), state, fan, temperature=0.0)
-    close(cold, rollout.imagine(MODEL, variables, jax.random.key(1), state, fan, sampled=False))
+    assert_close(cold, rollout.imagine(MODEL, variables, jax.random.key(1), state, fan, sampled=False))
     shared = rollout.imagine(MODEL, variables, jax.random.key(1), state, fan, same_noise=True)
-    close(shared[:, 0], shared[:, 1], 0)
+    assert_close(shared[:, 0], shared[:, 1], 0)
     assert not np.allclose(shared.states.stochastic[:, 0], shared.states.stochastic[:, 2])
 
 
@@ -228,8 +228,8 @@ def test_transforms_from_outside_agree(variables, state, actions):
     dream = lambda key, state, actions: rollout.imagine(MODEL, variables, key, state, actions, sampled=False).features
     key = jax.random.key(0)
     want = dream(key, state, actions)
-    close(jax.jit(dream)(key, state, actions), want)
-    close(jax.vmap(dream, (None, 0, 0))(key, state, actions), want)
+    assert_close(jax.jit(dream)(key, state, actions), want)
+    assert_close(jax.vmap(dream, (None, 0, 0))(key, state, actions), want)
     policy = lambda weight, key, features: jnp.tanh(weight @ features)
     roll = lambda weight: rollout.imagine(MODEL, variables, key, state, jax.tree_util.Partial(policy, weight),
                                           horizon=2).features.sum()

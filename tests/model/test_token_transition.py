@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from windows import make_window
 
 from muvo_jax import config as config_lib
 from muvo_jax import presets
@@ -26,12 +27,7 @@ def variables():
 
 @pytest.fixture(scope="module")
 def window():
-    """(embedding, action, is_first, noise) of BATCH x FRAMES."""
-    keys = jax.random.split(jax.random.key(1), BATCH)
-    embedding = jax.random.normal(jax.random.key(2), (BATCH, FRAMES, OBSERVED_TOKENS, CONFIG.token_channels))
-    action = jax.random.uniform(jax.random.key(3), (BATCH, FRAMES, 2), minval=-1.0)
-    is_first = jnp.zeros((BATCH, FRAMES), bool).at[:, 0].set(True)
-    return embedding, action, is_first, rollout.draw_noise(keys, FRAMES, SHAPE, 0.5, dropout=True)
+    return make_window(BATCH, FRAMES, (OBSERVED_TOKENS, CONFIG.token_channels), SHAPE, dropout=True)
 
 
 @pytest.fixture(scope="module")
@@ -44,7 +40,7 @@ filter_window = jax.jit(lambda variables, *window: rollout.filter_embeddings(MOD
 imagine_step = jax.jit(MODEL.imagine_step)
 
 
-def close(first, second, tolerance=2e-5):
+def assert_close(first, second, tolerance=2e-5):
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=tolerance, rtol=1e-4), first, second)
 
 
@@ -97,8 +93,8 @@ def test_scan_equals_a_loop_by_hand(variables, window):
                                          is_first[:, index])
         coin = noise.use_prior[:, index, None, None] & (index > 0)
         carried = np.where(coin, prior.sample(noise.prior[:, index]), posterior.sample(noise.posterior[:, index]))
-        close(state.stochastic, carried)
-        close(observed[:, index], observed[:, index].replace(
+        assert_close(state.stochastic, carried)
+        assert_close(observed[:, index], observed[:, index].replace(
             states=LatentState(state.deterministic, posterior.sample(noise.posterior[:, index])), prior=prior,
             posterior=posterior))
 
@@ -109,7 +105,7 @@ def test_is_first_makes_a_fresh_start(variables, window):
     observed = filter_window(variables, embedding, action, restart, noise)
     shift = lambda leaf: jnp.concatenate([leaf[:, 1:], leaf[:, :1]], axis=1)
     later = filter_window(variables, shift(embedding), shift(action), is_first, jax.tree.map(shift, noise))
-    close(observed[:, 1:], later[:, :-1])
+    assert_close(observed[:, 1:], later[:, :-1])
     assert not np.allclose(filter_window(variables, *window).posterior.mean[:, 1], observed.posterior.mean[:, 1],
                            atol=1e-4)
 
@@ -118,7 +114,7 @@ def test_dropout_follows_each_samples_key_and_is_off_without(variables, window):
     embedding, action, is_first, noise = window
     swapped = filter_window(variables, *jax.tree.map(lambda leaf: leaf[::-1], window))
     with_dropout = filter_window(variables, *window)
-    close(swapped[::-1], with_dropout)
+    assert_close(swapped[::-1], with_dropout)
     without = filter_window(variables, embedding, action, is_first, noise.replace(dropout=None))
     assert not np.allclose(without.posterior.mean, with_dropout.posterior.mean, atol=1e-3)
     assert not np.allclose(without.prior.mean, with_dropout.prior.mean, atol=1e-3)
@@ -130,7 +126,7 @@ def test_imagining_a_batch_is_imagining_each_alone(variables, state):
     assert whole.states.stochastic.shape == (BATCH, 4, *SHAPE)
     for index in range(BATCH):
         one = slice(index, index + 1)
-        close(rollout.imagine(MODEL, variables, keys[one], state[one], actions[one]), whole[one])
+        assert_close(rollout.imagine(MODEL, variables, keys[one], state[one], actions[one]), whole[one])
     assert not np.allclose(whole.states.stochastic[0, -1], whole.states.stochastic[1, -1], atol=1e-2)
 
 

@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from windows import make_window
 
 from muvo_jax import presets
 from muvo_jax.model import rollout, transition, world_model
@@ -24,12 +25,7 @@ def variables():
 
 @pytest.fixture(scope="module")
 def window():
-    """(embedding, action, is_first, noise) of BATCH x FRAMES."""
-    keys = jax.random.split(jax.random.key(1), BATCH)
-    embedding = jax.random.normal(jax.random.key(2), (BATCH, FRAMES, CONFIG.embedding_channels))
-    action = jax.random.uniform(jax.random.key(3), (BATCH, FRAMES, 2), minval=-1.0)
-    is_first = jnp.zeros((BATCH, FRAMES), bool).at[:, 0].set(True)
-    return embedding, action, is_first, rollout.draw_noise(keys, FRAMES, (CHANNELS,), 0.5)
+    return make_window(BATCH, FRAMES, (CONFIG.embedding_channels,), (CHANNELS,))
 
 
 def test_gru_by_hand():

@@ -9,7 +9,8 @@ import pytest
 
 from muvo_jax import config as config_lib
 from muvo_jax import presets, types
-from muvo_jax.objectives import total
+from muvo_jax.model import heads
+from muvo_jax.objectives import terms, total
 
 MODEL = presets.tiny().model
 LOSS = config_lib.LossConfig(chamfer=0.1, chamfer_points=8)
@@ -115,3 +116,10 @@ def test_terms_and_weights_must_be_the_same_set():
         total.combine(sums, {name: weight for name, weight in weights.items() if name != "kl"})
     with pytest.raises(ValueError, match=r"weighted but not computed \['depth'\]"):
         total.combine(sums, weights | {"depth": 1.0})
+
+
+def test_every_head_has_a_decoder_targets_and_terms_of_one_name():
+    assert tuple(config_lib.TARGETS) == tuple(heads.TABLE)
+    assert set(terms.TABLE) == set(heads.TABLE) - {"birds_eye"}
+    fields = {field.name for field in dataclasses.fields(config_lib.LossConfig)}
+    assert {field for row in terms.TABLE.values() for field, _ in row.weights.values()} <= fields

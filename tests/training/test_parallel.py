@@ -53,7 +53,7 @@ def gradients_under(mode, model, config, batch, state):
     return jax.tree.map(np.asarray, compiled(parallel_lib.place_state(plan, state), placed))
 
 
-def check_equal(got, want):
+def assert_same_gradients(got, want):
     """Gradients within a share of their global norm; statistics and metrics within float32 noise."""
     norm = float(optax.global_norm(want[0]))
     assert norm > 1e-3
@@ -71,11 +71,11 @@ def gradients_of_one_device(accumulate, heads):
 @pytest.mark.parametrize("mode", ["pmap", "shard_map"])
 def test_many_devices_give_the_gradients_of_one(mode):
     assert jax.device_count() >= small_world.WINDOWS
-    check_equal(gradients_under(mode, *setting()), gradients_of_one_device(1, config_lib.HEADS))
+    assert_same_gradients(gradients_under(mode, *setting()), gradients_of_one_device(1, config_lib.HEADS))
 
 
 def test_accumulation_is_spread_alike():
-    check_equal(gradients_under("shard_map", *setting(2, FEW)), gradients_of_one_device(2, FEW))
+    assert_same_gradients(gradients_under("shard_map", *setting(2, FEW)), gradients_of_one_device(2, FEW))
 
 
 def test_accumulation_averages_the_gradients_of_its_micro_batches():
@@ -169,7 +169,7 @@ def test_plans():
 @pytest.mark.slow
 @pytest.mark.parametrize("mode", ["pmap", "shard_map"])
 def test_the_world_model_itself_gives_the_gradients_of_one_device(mode):
-    check_equal(gradients_under(mode, *world_model_setting()), world_model_gradients_of_one_device())
+    assert_same_gradients(gradients_under(mode, *world_model_setting()), world_model_gradients_of_one_device())
 
 
 @functools.cache

@@ -1,0 +1,57 @@
+"""What a model decodes: its heads by name, the recorded truth that each is compared with, the weights of the terms.
+
+A new head is one row in each of four places, all by the same name, and nothing else:
+
+1. TARGETS below: the Batch fields that its loss reads, each with its shape for one frame. A field that no recording had
+   so far also needs a line in types.Batch, types.BATCH_FIELDS and data/schema.RawFrame, and a reader that fills it.
+2. model/heads.TABLE: its decoder (`_vector` for a number or a few of them).
+3. objectives/terms.TABLE: its loss terms, each with the field of LossConfig that weighs it.
+4. LossConfig below: these weights.
+
+Then --with-heads=NAME trains it, a recording without its fields is refused by name, and `decode` returns it.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Mapping
+from typing import Any, Literal
+
+HEADS = ("image", "range_view", "occupancy", "action")  # of the paper; the others are optional
+BIRDS_EYE_CLASSES = 8
+Shapes = Mapping[str, tuple[int, ...]]
+
+# Head -> what a ModelConfig makes of it: Batch field -> its shape for one frame.
+TARGETS: dict[str, Callable[[Any], Shapes]] = {
+    "image": lambda model: {"image": (*model.image_size, 3)},
+    "range_view": lambda model: {"range_view": (model.range_view.rows, model.range_view.columns, 4)},
+    "occupancy": lambda model: {"occupancy": model.voxels.shape},
+    "action": lambda model: {"action": (2,)},
+    "birds_eye": lambda model: {"birds_eye": model.voxels.shape[:2]},
+}
+ALL_HEADS = tuple(TARGETS)
+
+
+@dataclasses.dataclass(frozen=True)
+class LossConfig:
+    """Weights of the loss terms (paper Eq. 1) at scale 1; scale f counts 1/f.
+
+    `image` (L1), `image_squared` (L2, an addition to the paper), `range_xyz`, `range_depth` and `occupancy_*` apply per
+    scale; 0 switches a term off. The Chamfer term looks at `chamfer_points` returns of each side; a predicted return is
+    a predicted range above `return_threshold_m`.
+    """
+
+    image: float = 0.1
+    image_squared: float = 0.0
+    range_xyz: float = 0.1
+    range_depth: float = 0.1
+    occupancy_cross_entropy: float = 0.1
+    occupancy_semantic_scal: float = 0.1
+    occupancy_geometric_scal: float = 0.1
+    chamfer: float = 0.0
+    action: float = 1.0
+    kl: float = 1e-3
+    kl_balance: float = 0.75
+    chamfer_points: int = 1024
+    return_threshold_m: float = 1.0
+    occupancy_unknown: Literal["ignore", "empty"] = "ignore"

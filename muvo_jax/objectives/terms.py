@@ -1,0 +1,110 @@
+"""The one table of loss terms: for each head how they are computed and what weighs them.
+
+A term is reduced to sums that add over samples and devices; `total` adds them over devices and asks each for its value
+only then. What a new head takes is written in config_heads.py.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Mapping
+from typing import Protocol
+
+import jax.numpy as jnp
+
+from muvo_jax import config as config_lib
+from muvo_jax import types
+from muvo_jax.objectives import chamfer, labels, regression, scal
+
+
+class Sums(Protocol):
+    """A pytree of numbers that add over samples and devices, such as regression.MeanSums."""
+
+    def terms(self, name: str) -> dict[str, types.Array]:
+        """{term: value} from the sums of a whole batch that stand under `name`."""
+        ...
+
+
+@dataclasses.dataclass(frozen=True)
+class Inputs:
+    """What the terms of a head are computed from.
+
+    Attributes:
+      predictions: scale -> [B, T, ...], at every scale of the head.
+      batch: has every field that config.TARGETS names for the head.
+      model, loss: units and settings.
+      keys: typed keys [B], one per sample, for terms that draw.
+    """
+
+    predictions: Mapping[int, types.Array]
+    batch: types.Batch
+    model: config_lib.ModelConfig
+    loss: config_lib.LossConfig
+    keys: types.Array
+
+    def truth(self, field: str) -> types.Array:
+        """[B, T, ...], a field of the batch that config.TARGETS names for the head."""
+        return jnp.asarray(getattr(self.batch, field))
+
+
+@dataclasses.dataclass(frozen=True)
+class HeadTerms:
+    """The loss terms of one head.
+
+    Attributes:
+      sums: computes them, {name: Sums}; together their `terms` are at most the keys of `weights`.
+      weights: term -> (the field of LossConfig that weighs it, a factor on that).
+    """
+
+    sums: Callable[[Inputs], dict[str, Sums]]
+    weights: Mapping[str, tuple[str, float]]
+
+
+def scaled(*fields: str) -> dict[str, tuple[str, float]]:
+    """A term at every scale f for each of these fields of LossConfig, named field_f, at 1/f of its weight."""
+    return {f"{field}_{scale}": (field, 1.0 / scale) for field in fields for scale in labels.SCALES}
+
+
+def single(*fields: str) -> dict[str, tuple[str, float]]:
+    """One term for each of these fields of LossConfig, of the same name and weight."""
+    return {field: (field, 1.0) for field in fields}
+
+
+def _image(inputs: Inputs) -> dict[str, Sums]:
+    sums: dict[str, Sums] = {}
+    for scale, target in labels.image_labels(inputs.truth("image")).items():
+        sums[f"image_{scale}"] = regression.l1_sums(inputs.predictions[scale], target)
+        sums[f"image_squared_{scale}"] = regression.l2_sums(inputs.predictions[scale], target)
+    return sums
+
+
+def _range_view(inputs: Inputs) -> dict[str, Sums]:
+    model, loss, range_view = inputs.model, inputs.loss, inputs.truth("range_view")
+    sums: dict[str, Sums] = {}
+    for scale, target in labels.range_view_labels(range_view).items():
+        sums[f"range_xyz_{scale}"], sums[f"range_depth_{scale}"] = regression.range_view_sums(
+            inputs.predictions[scale], target, scale_m=model.range_scale_m, mask_holes=model.numerics == "standard")
+    if loss.chamfer:
+        sums["chamfer_1"] = chamfer.chamfer_sums(
+            inputs.predictions[1], range_view, inputs.keys, points=loss.chamfer_points, scale_m=model.range_scale_m,
+            return_threshold_m=loss.return_threshold_m)
+    return sums
+
+
+def _occupancy(inputs: Inputs) -> dict[str, Sums]:
+    return {f"occupancy_{scale}": scal.occupancy_sums(inputs.predictions[scale], target,
+                                                      inputs.loss.occupancy_unknown == "empty")
+            for scale, target in labels.occupancy_labels(inputs.truth("occupancy")).items()}
+
+
+def _action(inputs: Inputs) -> dict[str, Sums]:
+    return {"action": regression.l1_sums(inputs.predictions[1], inputs.truth("action"))}
+
+
+TABLE: dict[str, HeadTerms] = {
+    "image": HeadTerms(_image, scaled("image", "image_squared")),
+    "range_view": HeadTerms(_range_view, scaled("range_xyz", "range_depth") | {"chamfer_1": ("chamfer", 1.0)}),
+    "occupancy": HeadTerms(_occupancy, scaled("occupancy_cross_entropy", "occupancy_semantic_scal",
+                                              "occupancy_geometric_scal")),
+    "action": HeadTerms(_action, single("action")),
+}

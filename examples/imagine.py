@@ -6,21 +6,15 @@ import jax
 import jax.numpy as jnp
 
 import muvo_jax
-from muvo_jax import command_line
-from muvo_jax.data import pipeline
-from muvo_jax.training import checkpoint, screen
 
 
 def main(run: str) -> None:
-    config = checkpoint.load_run(run).config
     model, variables = muvo_jax.load(run)
-    frames = pipeline.Frames(command_line.open_data(config, screen.Screen()), config)
-    split = frames.recording.description.splits[-1]
-    batches = pipeline.evaluation_batches(frames, split, windows=2, batch=2, length=config.data.context)
-    batch = next(iter(batches)).batch
+    batch = muvo_jax.windows(run, count=2)
+    past = batch.time_slice(0, batch.frames // 2)
 
     key_observe, key_imagine = jax.random.split(jax.random.key(0))
-    observed = muvo_jax.observe(model, variables, key_observe, batch)
+    observed = muvo_jax.observe(model, variables, key_observe, past)
     brake_or_go = jnp.stack([jnp.full((8, 2), -0.5), jnp.full((8, 2), 0.5)])  # [B = 2, horizon = 8, 2]
     dream = muvo_jax.imagine(model, variables, key_imagine, observed.last, brake_or_go.at[..., 1].set(0.0), branches=16)
     print("16 futures of 8 steps for 2 starts:", dream.features.shape)

@@ -1,6 +1,7 @@
 """MUVO, a multimodal generative world model for driving, in JAX.
 
     model, variables = muvo_jax.load("runs/town-tr")
+    batch = muvo_jax.windows("runs/town-tr", frames=6)
     observed = muvo_jax.observe(model, variables, key, batch)
     dream = muvo_jax.imagine(model, variables, key, observed.last, actions)
     pictures = muvo_jax.decode(model, variables, dream.states, heads=("image", "occupancy"))
@@ -18,6 +19,7 @@ from muvo_jax.types import Batch, Dream, Gaussian, LatentState, Observed
 __all__ = [
     "Batch", "Config", "Dream", "Gaussian", "LatentState", "LiveState", "ModelConfig", "Observed", "WorldModel",
     "decode", "imagine", "load", "observe", "observe_step", "presets", "start_live",
+    "windows",
 ]
 
 
@@ -33,3 +35,21 @@ def load(run):
     from muvo_jax.training import checkpoint  # imported late: imagining needs no checkpoint library
 
     return checkpoint.load(run)
+
+
+def windows(run, split=None, *, count=2, frames=None):
+    """Windows of the recording that a run was trained on: `windows("runs/town-tr") -> Batch [count, frames, ...]`.
+
+    Args:
+      run: folder that `python -m muvo_jax.train` wrote.
+      split: by default the first one that validates ("val_rl" of the town).
+      count: how many windows, evenly spread over the split.
+      frames: of each window, by default those of the run's evaluation (context and horizon).
+
+    Raises:
+      muvo_jax.training.checkpoint.CheckpointError: if the folder holds no readable checkpoint.
+      muvo_jax.data.schema.DataError: if the recording is gone, lacks the split, or has fewer windows of that length.
+    """
+    from muvo_jax.training import validation  # imported late, as above
+
+    return validation.windows_of_run(run, split, count=count, frames=frames)

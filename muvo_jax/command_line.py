@@ -20,7 +20,6 @@ import tyro
 
 from muvo_jax import config as config_lib
 from muvo_jax.data import schema, sources
-from muvo_jax.data.town import record
 from muvo_jax.training import host, screen
 
 TRACEBACK_VARIABLE = "MUVO_JAX_TRACEBACK"
@@ -131,10 +130,6 @@ def parse_settings(settings: Iterable[str]) -> dict[str, Any]:
 
 
 def open_data(config: config_lib.Config, show: screen.Screen) -> schema.Recording:
-    """The recording that a config names; the built-in town is recorded first where it is not in the cache."""
-    if config.data.path == "town":
-        with show.counter("recording the built-in town", "frames") as progress:
-            folder = record.cached_town(config, progress)
-        return sources.open_recording(folder)
-    return sources.open_recording(config.data.path, camera=config.data.camera,
-                                  skip_corrupt_shards=config.data.skip_corrupt_shards)
+    """The recording that a config names (sources.open_configured), with a progress bar where the town is recorded."""
+    with show.counter("recording the built-in town", "frames") as progress:
+        return sources.open_configured(config, progress)

@@ -68,6 +68,6 @@ def test_importing_the_library_loads_no_checkpoint_data_or_plotting_code():
 def test_public_names_are_these():
     assert sorted(muvo_jax.__all__) == [
         "Batch", "Config", "Dream", "Gaussian", "LatentState", "LiveState", "ModelConfig", "Observed", "WorldModel",
-        "decode", "imagine", "load", "observe", "observe_step", "presets", "start_live",
+        "decode", "imagine", "load", "observe", "observe_step", "presets", "start_live", "windows",
     ]
     assert all(getattr(muvo_jax, name) is not None for name in muvo_jax.__all__)

@@ -6,7 +6,9 @@ import pathlib
 from collections.abc import Callable
 from typing import NamedTuple
 
+from muvo_jax import config as config_lib
 from muvo_jax.data import carla, files, kitti, plain, records, schema
+from muvo_jax.data.town import record
 
 
 class Kind(NamedTuple):
@@ -70,3 +72,18 @@ def open_recording(path: pathlib.Path | str, *, camera: str = "",
                 return records.PackedRecording(path, corrupt="skip")
             return kind.open(path, camera=camera) if camera else kind.open(path)
     raise schema.DataError(f"data folder {path} is of no known kind. Known are {known}. Found {files.listing(path)}.")
+
+
+def open_configured(config: config_lib.Config, progress: record.Progress | None = None) -> schema.Recording:
+    """Opens the recording that a config names; the built-in town is recorded first where it is not in the cache.
+
+    Args:
+      progress: called with (frames done, frames in all) while the town is recorded.
+
+    Raises:
+      DataError: as open_recording.
+    """
+    if config.data.path == "town":
+        return open_recording(record.cached_town(config, progress))
+    return open_recording(config.data.path, camera=config.data.camera,
+                          skip_corrupt_shards=config.data.skip_corrupt_shards)

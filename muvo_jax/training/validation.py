@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator, Mapping
 
 import jax
@@ -9,9 +10,10 @@ import numpy as np
 
 from muvo_jax import config as config_lib
 from muvo_jax import types
-from muvo_jax.data import pipeline
+from muvo_jax.data import pipeline, prepare, schema, sources
 from muvo_jax.metrics import baselines, protocol
 from muvo_jax.model import world_model
+from muvo_jax.training import checkpoint
 from muvo_jax.training import state as state_lib
 from muvo_jax.training import step as step_lib
 
@@ -54,6 +56,21 @@ class Validator:
 def windows(frames: pipeline.Frames, split: str, count: int) -> Iterator[tuple[types.Batch, int]]:
     """At most `count` windows of a split (0: all) as `protocol.evaluate` takes them."""
     return ((entry.batch, entry.count) for entry in pipeline.evaluation_batches(frames, split, windows=count))
+
+
+def windows_of_run(run: str | os.PathLike, split: str | None = None, *, count: int,
+                   frames: int | None = None) -> types.Batch:
+    """See muvo_jax.windows."""
+    config = checkpoint.load_run(run).config
+    recording = sources.open_configured(config)
+    held_out = [name for name in recording.description.splits if name != "train"]
+    split = split or (held_out or ["train"])[0]
+    entry = next(pipeline.evaluation_batches(pipeline.Frames(recording, prepare.adapt(config, recording).config), split,
+                                             windows=count, length=frames, batch=count))
+    if entry.count < count:
+        raise schema.DataError(f"split {split!r} of {recording.description.name!r} has {entry.count} windows of "
+                               f"{entry.batch.frames} frames, {count} were asked for. Ask for fewer or shorter ones.")
+    return entry.batch
 
 
 def training_mean(frames: pipeline.Frames, most_frames: int = TRAINING_MEAN_FRAMES) -> tuple[baselines.Frames, int]:

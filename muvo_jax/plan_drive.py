@@ -106,7 +106,7 @@ def plan_drive(options: Options, show: screen.Screen) -> dict[str, Any]:
               "step_s": world.step_s, "seconds": options.seconds, "seeds": seeds, "route_m": town.config.route_m,
               "scores": scores, "sensitivity": answers,
               "drives": {name: [describe(one, seed) for one, seed in zip(runs, seeds, strict=True)]
-                                           for name, runs in drives.items()},
+                         for name, runs in drives.items()},
               "packages": checkpoint_meta.package_versions()}
     show.console.print(screen_table(scores, options))
     for line in sensitivity_rows(answers):

@@ -19,6 +19,7 @@ from typing import Any, Literal
 
 HEADS = ("image", "range_view", "occupancy", "action")  # of the paper; the others are optional
 BIRDS_EYE_CLASSES = 8
+EGO_MOTION_UNITS = (1.0, 0.1, 0.05, 5.0)  # m forward, m left, rad, m/s: about what a step of 0.2 s brings
 Shapes = Mapping[str, tuple[int, ...]]
 
 # Head -> what a ModelConfig makes of it: Batch field -> its shape for one frame.
@@ -28,6 +29,9 @@ TARGETS: dict[str, Callable[[Any], Shapes]] = {
     "occupancy": lambda model: {"occupancy": model.voxels.shape},
     "action": lambda model: {"action": (2,)},
     "birds_eye": lambda model: {"birds_eye": model.voxels.shape[:2]},
+    "reward": lambda model: {"reward": ()},
+    "continue": lambda model: {"is_terminal": ()},
+    "ego_motion": lambda model: {"ego_motion": (4,)},
 }
 ALL_HEADS = tuple(TARGETS)
 
@@ -38,7 +42,8 @@ class LossConfig:
 
     `image` (L1), `image_squared` (L2, an addition to the paper), `range_xyz`, `range_depth` and `occupancy_*` apply per
     scale; 0 switches a term off. The Chamfer term looks at `chamfer_points` returns of each side; a predicted return is
-    a predicted range above `return_threshold_m`.
+    a predicted range above `return_threshold_m`. `reward` (L2), `continue_` (cross-entropy) and `ego_motion` (L1 in
+    EGO_MOTION_UNITS) are of the optional heads.
     """
 
     image: float = 0.1
@@ -50,6 +55,9 @@ class LossConfig:
     occupancy_geometric_scal: float = 0.1
     chamfer: float = 0.0
     action: float = 1.0
+    reward: float = 1.0
+    continue_: float = 1.0
+    ego_motion: float = 0.1
     kl: float = 1e-3
     kl_balance: float = 0.75
     chamfer_points: int = 1024

@@ -57,6 +57,8 @@ class Batch(_Indexable):
       target_m, next_target_m: float32 [B, T, 2], the places that the two commands belong to, seen from the ego.
       reward: float32 [B, T].
       is_terminal: bool [B, T].
+      ego_motion: float32 [B, T, 4], forward and left (m) in the ego frame of the window's frame before, turn to the
+        left (rad) since then, and speed (m/s); the first three are meaningless where is_first.
       intrinsics: float32 [B, 3, 3], of the image as it is here, after resizing and cropping.
       camera_to_ego: float32 [B, 4, 4], camera frame (x right, y down, z forward) to ego frame.
     """
@@ -76,6 +78,7 @@ class Batch(_Indexable):
     next_target_m: ArrayLike | None = None
     reward: ArrayLike | None = None
     is_terminal: ArrayLike | None = None
+    ego_motion: ArrayLike | None = None
     intrinsics: ArrayLike | None = None
     camera_to_ego: ArrayLike | None = None
 
@@ -123,7 +126,8 @@ BATCH_FIELDS = {  # dtype, rank
     "points": (np.float32, 4), "point_count": (np.int32, 2), "command": (np.int32, 2), "next_command": (np.int32, 2),
     "target_m": (np.float32, 3), "next_target_m": (np.float32, 3), "occupancy": (np.uint8, 5),
     "route_map": (np.uint8, 4), "speed_mps": (np.float32, 2), "reward": (np.float32, 2),
-    "is_terminal": (np.bool_, 2), "intrinsics": (np.float32, 3), "camera_to_ego": (np.float32, 3),
+    "is_terminal": (np.bool_, 2), "ego_motion": (np.float32, 3), "intrinsics": (np.float32, 3),
+    "camera_to_ego": (np.float32, 3),
 }
 
 

@@ -25,7 +25,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from muvo_jax import config as config_lib
-from muvo_jax.data import carla_files, description, files, safe_pickle, schema
+from muvo_jax.data import carla_files, description, ego_motion, files, safe_pickle, schema
 from muvo_jax.ops import camera as camera_ops
 
 FRAME_FILE = "pd_dataframe.pkl"
@@ -138,6 +138,8 @@ class CarlaRecording:
         self._actions = {run.name: actions(run) for run in kept}
         self._speeds = {run.name: run.numbers("speed", 1)[:, 0] for run in kept}
         self._yaw_rates = {run.name: yaw_rates(run) for run in kept if "imu" in run.columns}
+        self._poses = {name: ego_motion.dead_reckoned(self._speeds[name], rates, rate_hz)
+                       for name, rates in self._yaw_rates.items()}
         self._rewards = {run.name: np.clip(run.numbers("reward", 1)[:, 0], -1.0, 1.0) for run in kept}
         self.sequences = tuple(sequence for run in kept
                                for sequence in _cut(run, modalities, self._kinds, skipped_s, rate_hz))
@@ -168,6 +170,7 @@ class CarlaRecording:
         }
         if run.name in self._yaw_rates:
             frame["yaw_rate_radps"] = self._yaw_rates[run.name][row]
+            frame["pose"] = self._poses[run.name][row]
         paths = {key: run.path(kind, row) for key, kind in self._kinds.items() if key in described.modalities}
         if described.camera is not None and "image" in paths:
             camera = described.camera
@@ -280,7 +283,7 @@ def _modalities(runs: list[Run], kinds: dict[str, str]) -> frozenset[str]:
     """The keys of RawFrame that at least one run has files of; where another run lacks one, its frames are left out."""
     names = {"speed_mps", "action", "reward", "is_terminal", "timestamp_s", "frame_id"}
     if all("imu" in run.columns for run in runs):
-        names.add("yaw_rate_radps")
+        names |= {"yaw_rate_radps", "pose"}
     names |= {key for key, kind in kinds.items()
               if any(f"{kind}_path" in run.columns and run.path(kind, 0).parent.is_dir() for run in runs)}
     if "image" in names:

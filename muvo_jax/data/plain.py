@@ -28,7 +28,8 @@ FRAMES_FILE = "frames.csv"
 _FILES = {"image": ("image", (".png", ".jpg", ".jpeg")), "points_m": ("lidar", (".npz",)),
           "occupancy": ("occupancy", (".npz",)), "route_map": ("route_map", (".png",))}
 _COLUMNS = ("frame_id", "timestamp_s", "speed_mps", "acceleration", "steering")
-_OPTIONAL_COLUMNS = ("reward", "is_terminal", "yaw_rad")
+_OPTIONAL_COLUMNS = ("reward", "is_terminal", "x_m", "y_m", "yaw_rad")
+_POSE = ("x_m", "y_m", "yaw_rad")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -80,6 +81,8 @@ class PlainRecording:
             "timestamp_s": np.float64(columns["timestamp_s"][position]),
             "frame_id": np.int64(frame_id),
         }
+        if "pose" in described.modalities:
+            frame["pose"] = np.array([columns[name][position] for name in _POSE])
         if "yaw_rate_radps" in described.modalities:
             frame["yaw_rate_radps"] = np.float32(columns["yaw_rate_radps"][position])
         if "reward" in described.modalities:
@@ -170,7 +173,7 @@ def _read_table(path: pathlib.Path) -> dict[str, np.ndarray]:
                for name in _COLUMNS + optional}
     files.check_increasing(columns["timestamp_s"], [f"{path}, line {line + 2}" for line in range(len(rows))])
     if "yaw_rad" in columns and len(rows) > 1:
-        columns["yaw_rate_radps"] = _rates(columns.pop("yaw_rad"), columns["timestamp_s"])
+        columns["yaw_rate_radps"] = _rates(columns["yaw_rad"], columns["timestamp_s"])
     return columns
 
 
@@ -198,6 +201,8 @@ def _modalities(runs: list[Run]) -> frozenset[str]:
     names |= {key for key, (folder, _) in _FILES.items() if any((run.folder / folder).is_dir() for run in runs)}
     names |= {name for name in ("reward", "is_terminal", "yaw_rate_radps")
               if all(name in run.columns for run in runs)}
+    if all(run.columns.keys() >= set(_POSE) for run in runs):
+        names.add("pose")
     if "image" in names:
         names |= {"intrinsics", "camera_to_ego"}
     return frozenset(names)

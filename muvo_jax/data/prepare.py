@@ -26,6 +26,8 @@ _SHORT = {"stride": 1, "context": 4, "horizon": 4, "frames": 8}
 _SIDE_MULTIPLE = 32
 # Targets that every recording has, or that are made of what it has; the others it must hold itself.
 _ALWAYS_THERE = frozenset({"image", "range_view", "occupancy", "action"})
+# Targets that are made of other fields of a frame.
+_MADE_OF = {"ego_motion": frozenset({"pose", "speed_mps"})}
 NAVIGATION = ("command", "next_command", "target_m", "next_target_m")
 
 PreparedFrame = dict[str, np.ndarray | np.generic]  # names and dtypes of types.Batch without B and T
@@ -96,13 +98,17 @@ def prepare_frame(raw: schema.RawFrame, config: config_lib.Config) -> PreparedFr
     for name in ("reward", "is_terminal", *(model.targets.keys() - _ALWAYS_THERE)):
         if name in raw:
             ready[name] = raw[name]  # type: ignore[literal-required]
+    if "ego_motion" in model.targets:  # still in the frame of the run: motion begins with a second frame
+        ready["ego_motion"] = np.array([*raw["pose"], raw["speed_mps"]])
     return ready
 
 
 def check_targets(model: config_lib.ModelConfig, description: schema.RecordingDescription) -> None:
     """Raises DataError where a head cannot be trained: names the head, what the recording lacks, and the way out."""
     for head in model.heads:
-        for field in config_lib.TARGETS[head](model).keys() - _ALWAYS_THERE - description.modalities:
+        fields = config_lib.TARGETS[head](model).keys() - _ALWAYS_THERE
+        needed = frozenset().union(*(_MADE_OF.get(field, {field}) for field in fields))
+        for field in sorted(needed - description.modalities):
             others = ",".join(name for name in model.heads if name != head)
             raise schema.DataError(f"head {head!r} learns from {field}, which recording {description.name!r} does not "
                                    f"hold. Leave the head out (--heads={others}), or record {field}.")

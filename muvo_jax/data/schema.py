@@ -35,6 +35,7 @@ class RawFrame(TypedDict, total=False):
       action: float32 [2], applied from this frame to the next.
       speed_mps, reward, is_terminal, timestamp_s: scalars.
       command, next_command: int32 scalars, 0 to 5; target_m, next_target_m: float32 [2] (muvo_jax.types.Batch).
+      pose: float64 [3], x, y (m) and yaw (rad) of the ego in a frame that stands still during the run.
       yaw_rate_radps: measured, left positive; for checks, no model sees it.
       frame_id: the recording's own number.
     """
@@ -46,6 +47,7 @@ class RawFrame(TypedDict, total=False):
     occupancy: np.ndarray
     route_map: np.ndarray
     speed_mps: np.float32
+    pose: np.ndarray
     yaw_rate_radps: np.float32
     command: np.int32
     next_command: np.int32

@@ -129,6 +129,19 @@ def parse_settings(settings: Iterable[str]) -> dict[str, Any]:
     return parsed
 
 
+def which_checkpoint(text: str) -> str | int:
+    """"latest", "best" or a step, as checkpoint.load_run takes it, from what --checkpoint says.
+
+    Raises:
+      ValueError: for anything else.
+    """
+    if text in ("latest", "best"):
+        return text
+    if text.isdecimal():
+        return int(text)
+    raise ValueError(f"--checkpoint: got {text!r}, expected latest, best or a step such as 400.")
+
+
 def open_data(config: config_lib.Config, show: screen.Screen) -> schema.Recording:
     """The recording that a config names (sources.open_configured), with a progress bar where the town is recorded."""
     with show.counter("recording the built-in town", "frames") as progress:

@@ -64,7 +64,7 @@ python -m muvo_jax.dream runs/town-tr --branches=3  (three sampled futures)
 
 def dream(options: Options, show: screen.Screen) -> list[pathlib.Path]:
     """Does what the command line asks for; returns the files written."""
-    loaded = checkpoint.load_run(options.run, evaluate.which(options.checkpoint))
+    loaded = checkpoint.load_run(options.run, command_line.which_checkpoint(options.checkpoint))
     for text in loaded.warnings:
         show.warn(text)
     config = loaded.config

@@ -18,7 +18,7 @@ from muvo_jax import command_line
 from muvo_jax import config as config_lib
 from muvo_jax.data import pipeline, prepare
 from muvo_jax.metrics import protocol
-from muvo_jax.training import checkpoint, screen, validation
+from muvo_jax.training import checkpoint, checkpoint_meta, screen, validation
 
 # metric -> (label, decimals, whether higher is better)
 METRICS = {
@@ -70,7 +70,7 @@ python -m muvo_jax.evaluate runs/town-tr --context=8 --horizon=10 --checkpoint=b
 
 def evaluate(options: Options, show: screen.Screen) -> dict[str, Any]:
     """Does what the command line asks for; returns what evaluation.json holds."""
-    loaded = checkpoint.load_run(options.run, which(options.checkpoint))
+    loaded = checkpoint.load_run(options.run, command_line.which_checkpoint(options.checkpoint))
     for text in loaded.warnings:
         show.warn(text)
     config = loaded.config
@@ -89,7 +89,7 @@ def evaluate(options: Options, show: screen.Screen) -> dict[str, Any]:
         "run": str(loaded.folder), "variant": config.model.variant, "step": loaded.step,
         "parameters": sum(leaf.size for leaf in jax.tree.leaves(loaded.variables["params"])),
         "data": {"name": recording.description.name, "path": config.data.path}, "protocol": protocol.identity(config),
-        "training_mean_frames": mean_frames, "packages": checkpoint.package_versions(), "splits": {}}
+        "training_mean_frames": mean_frames, "packages": checkpoint_meta.package_versions(), "splits": {}}
     for split in splits:
         show.line(f"evaluating {split} ...", style="dim")
         scores = protocol.evaluate(loaded.model, loaded.variables,
@@ -103,15 +103,6 @@ def evaluate(options: Options, show: screen.Screen) -> dict[str, Any]:
     return report
 
 
-def which(text: str) -> str | int:
-    """"latest", "best" or a step."""
-    if text in ("latest", "best"):
-        return text
-    if text.isdigit():
-        return int(text)
-    raise ValueError(f"--checkpoint: got {text!r}, expected latest, best or a step such as 400.")
-
-
 def fit(config: config_lib.Config, recording, chosen: tuple[str, ...]) -> config_lib.Config:
     """The config fitted to a recording, whose sensors must be those that the model was trained with.
 
@@ -120,7 +111,7 @@ def fit(config: config_lib.Config, recording, chosen: tuple[str, ...]) -> config
     """
     fitted = prepare.adapt(config, recording, keep=chosen).config
     where = f"recording {recording.description.name!r} asks for another model than this run, which"
-    checkpoint.check_architecture(fitted, config, where)
+    checkpoint_meta.check_architecture(fitted, config, where)
     return fitted
 
 

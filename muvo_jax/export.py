@@ -25,7 +25,7 @@ import jax.numpy as jnp
 import numpy as np
 import tyro
 
-from muvo_jax import command_line, evaluate, types
+from muvo_jax import command_line, types
 from muvo_jax import config as config_lib
 from muvo_jax.model import live as live_lib
 from muvo_jax.model import rollout, world_model
@@ -69,7 +69,7 @@ def export(options: Options, show: screen.Screen) -> list[pathlib.Path]:
             raise ValueError(f"export needs {library}: pip install 'muvo_jax[export]'")
     if options.out.exists() and any(options.out.iterdir()):
         raise ValueError(f"OUT: {options.out} is not empty; name a new folder.")
-    loaded = checkpoint.load_run(options.run, evaluate.which(options.checkpoint))
+    loaded = checkpoint.load_run(options.run, command_line.which_checkpoint(options.checkpoint))
     for text in loaded.warnings:
         show.warn(text)
     horizon = loaded.config.data.horizon if options.horizon is None else options.horizon

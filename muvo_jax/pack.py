@@ -1,4 +1,4 @@
-"""Packs a recording into ArrayRecord shards: python -m muvo_jax.pack SRC OUT."""
+"""python -m muvo_jax.pack SRC OUT: a recording as ArrayRecord shards."""
 
 from __future__ import annotations
 

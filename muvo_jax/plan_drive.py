@@ -21,7 +21,7 @@ from muvo_jax.data import prepare
 from muvo_jax.data.town import record, settings, simulator
 from muvo_jax.metrics import protocol
 from muvo_jax.model import rollout
-from muvo_jax.training import checkpoint, screen
+from muvo_jax.training import checkpoint, checkpoint_meta, screen
 from muvo_jax.viz import canvas, sheets
 
 FIRST_SEED = 5_000  # no recorded drive has these seeds
@@ -74,7 +74,7 @@ python -m muvo_jax.plan_drive runs/town-tr --episodes=2 --seconds=8 --seed=1
 
 def plan_drive(options: Options, show: screen.Screen) -> dict[str, Any]:
     """Does what the command line asks for; returns what plan_drive.json holds."""
-    loaded = checkpoint.load_run(options.run, evaluate.which(options.checkpoint))
+    loaded = checkpoint.load_run(options.run, command_line.which_checkpoint(options.checkpoint))
     for text in loaded.warnings:
         show.warn(text)
     config = loaded.config
@@ -103,7 +103,7 @@ def plan_drive(options: Options, show: screen.Screen) -> dict[str, Any]:
               "step_s": world.step_s, "seconds": options.seconds, "seeds": seeds, "route_m": town.config.route_m,
               "scores": scores, "drives": {name: [describe(one, seed) for one, seed in zip(runs, seeds, strict=True)]
                                            for name, runs in drives.items()},
-              "packages": checkpoint.package_versions()}
+              "packages": checkpoint_meta.package_versions()}
     show.console.print(screen_table(scores, options))
     folder = options.out or loaded.folder / "plan_drive"
     folder.mkdir(parents=True, exist_ok=True)

@@ -1,4 +1,4 @@
-"""Makes occupancy from depth and lidar: python -m muvo_jax.voxelize PATH."""
+"""python -m muvo_jax.voxelize PATH: occupancy from depth and lidar, empty told from unknown."""
 
 from __future__ import annotations
 

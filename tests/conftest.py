@@ -1,8 +1,13 @@
-"""Every test sees 8 virtual CPU devices and raises on implicit rank promotion."""
+"""Every test sees 8 virtual CPU devices and raises on implicit rank promotion.
+
+Compiling takes most of the suite's time, so XLA leaves most of its optimisations out; JAX_DISABLE_MOST_OPTIMIZATIONS=0
+tests the programs that users run (.ci/run does so for the slow tests).
+"""
 
 import os
 
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
+os.environ.setdefault("JAX_DISABLE_MOST_OPTIMIZATIONS", "1")
 os.environ["XLA_FLAGS"] = os.environ.get("XLA_FLAGS", "") + " --xla_force_host_platform_device_count=8"
 
 import jax

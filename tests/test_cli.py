@@ -1,5 +1,6 @@
 """The commands as a user meets them: help, wrong options, and one clear line for an expected error."""
 
+import importlib
 import json
 import os
 import pathlib
@@ -10,9 +11,10 @@ import sys
 import pytest
 
 import muvo_jax
+from muvo_jax import __main__ as listing
 from muvo_jax import command_line, evaluate, presets, train
 from muvo_jax import config as config_lib
-from muvo_jax.training import run_folder, screen
+from muvo_jax.training import host, run_folder, screen
 
 ROOT = pathlib.Path(muvo_jax.__file__).parents[1]
 
@@ -34,16 +36,40 @@ def _main(capsys, *arguments):
     return code, capsys.readouterr()
 
 
-@pytest.mark.parametrize("module", ["train", "evaluate", "dream"])
-def test_help_has_examples_and_every_option_explained(module, capsys):
-    options = {"train": train, "evaluate": evaluate}.get(module) or __import__("muvo_jax.dream").dream
+def _module(command):
+    inside = "interop.parity.__main__" if command == "interop.parity" else command
+    return importlib.import_module(f"muvo_jax.{inside}")
+
+
+@pytest.mark.parametrize("command", listing.COMMANDS)
+def test_help_has_examples_and_every_option_explained(command, capsys, monkeypatch):
+    monkeypatch.setattr(host, "restart_with_huge_pages", lambda: None)
+    monkeypatch.setattr(sys, "argv", [command, "--help"])
     with pytest.raises(SystemExit) as ended:
-        command_line.run(options.Options, lambda *_: None, program=module, arguments=["--help"],
-                         examples=options.EXAMPLES)
+        _module(command).main()
     assert ended.value.code == 0
     text = capsys.readouterr().out
-    assert "Examples:" in text and text.count(f"python -m muvo_jax.{module} ") >= 3
+    _, _, examples = text.partition("Examples:")
+    assert f"python -m muvo_jax.{command} " in examples
     assert "None" not in text
+
+
+def test_the_package_alone_lists_every_command(capsys, monkeypatch):
+    package = ROOT / "muvo_jax"
+    written = {".".join(path.relative_to(package).with_suffix("").parts).removesuffix(".__main__")
+               for path in package.rglob("*.py") if "command_line.run(" in path.read_text(encoding="utf-8")}
+    assert written == set(listing.COMMANDS)
+    monkeypatch.setattr(sys, "argv", ["muvo_jax"])
+    assert listing.main() == 0
+    lines = capsys.readouterr().out.splitlines()
+    for command in listing.COMMANDS:
+        assert sum(line.startswith(f"  python -m muvo_jax.{command} ") for line in lines) == 1
+
+
+def test_a_command_as_argument_is_told_how_it_is_called(capsys, monkeypatch):
+    monkeypatch.setattr(sys, "argv", ["muvo_jax", "trian"])
+    assert listing.main() == 2
+    assert "did you mean python -m muvo_jax.train?" in capsys.readouterr().err
 
 
 def test_an_unknown_option_names_its_neighbours(capsys):

@@ -1,4 +1,4 @@
-"""python -m muvo_jax.interop.export_torch RUN OUT.safetensors: our weights under the reference's names and layouts."""
+"""python -m muvo_jax.interop.export_torch RUN OUT: a run's weights as safetensors for the authors' PyTorch model."""
 
 from __future__ import annotations
 
@@ -38,8 +38,7 @@ python -m muvo_jax.interop.export_torch runs/paper-tr weights.safetensors
 
 def export(options: Options, show) -> None:
     """Does what the command line asks for."""
-    chosen = int(options.checkpoint) if options.checkpoint.isdigit() else options.checkpoint
-    loaded = checkpoint.load_run(options.run, chosen)
+    loaded = checkpoint.load_run(options.run, command_line.which_checkpoint(options.checkpoint))
     variables = jax.tree.map(np.asarray, dict(loaded.variables))
     state_dict = names.reference_state_dict(variables, loaded.config.model)
     safetensors_file.save(options.out, state_dict, {

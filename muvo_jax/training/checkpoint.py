@@ -8,9 +8,7 @@ from it, was interrupted or damaged; `restore_latest` then takes the one before 
 
 from __future__ import annotations
 
-import base64
 import dataclasses
-import importlib.metadata
 import logging
 import os
 import pathlib
@@ -24,11 +22,9 @@ import orbax.checkpoint as ocp
 from muvo_jax import config as config_lib
 from muvo_jax import types
 from muvo_jax.model import world_model
-from muvo_jax.training import integrity
+from muvo_jax.training import checkpoint_meta, integrity
 
-SCHEMA_VERSION = 1
 FOLDER = "checkpoints"
-_PACKAGES = ("muvo_jax", "jax", "jaxlib", "flax", "optax", "orbax-checkpoint", "numpy")
 _preservation = ocp.checkpoint_managers
 
 
@@ -116,7 +112,7 @@ class Checkpoints:
         Raises:
           CheckpointError: where writing failed (disk full); earlier checkpoints stay untouched.
         """
-        meta = _meta(step, config, provenance, data_state, score)
+        meta = checkpoint_meta.describe(step, config, provenance, data_state, score)
         items = ocp.args.Composite(
             variables=ocp.args.StandardSave({"params": state.params, "batch_stats": state.batch_stats}),
             training=ocp.args.StandardSave({"opt_state": state.opt_state, "key": state.key, "step": state.step}),
@@ -161,17 +157,18 @@ class Checkpoints:
         warnings: list[str] = []
         abstract = jax.tree.map(_abstract, like)
         for step in reversed(self.steps()):
-            reason = integrity.damage(self.folder / str(step))
+            path = self.folder / str(step)
+            reason = integrity.damage(path)
             if reason is None:
-                meta = read_meta(self.folder / str(step))
-                check_architecture(config, config_lib.Config.from_dict(meta["config"]), str(self.folder / str(step)))
+                meta = checkpoint_meta.read(path)
+                checkpoint_meta.check_architecture(config, config_lib.Config.from_dict(meta["config"]), str(path))
                 try:
                     state = self._restore(step, abstract, like)
                 except Exception as error:  # whatever Orbax raises: the checkpoint before may still be good
                     reason = f"it cannot be restored ({_first_line(error)})"
                 else:
-                    return Restored(state, step, _decode(meta["data_state"]), meta, tuple(warnings))
-            warnings.append(f"checkpoint {self.folder / str(step)} is damaged: {reason}; trying the one before.")
+                    return Restored(state, step, checkpoint_meta.read_data_state(meta), meta, tuple(warnings))
+            warnings.append(f"checkpoint {path} is damaged: {reason}; trying the one before.")
         if warnings:
             raise CheckpointError(f"no readable checkpoint in {self.folder}: " + " ".join(warnings))
         return None
@@ -212,7 +209,7 @@ def save_variables(run_folder: str | os.PathLike, step: int, variables: types.Va
     with ocp.StandardCheckpointer() as writer:
         writer.save(folder / "variables", {"params": variables["params"], "batch_stats": variables["batch_stats"]})
     with ocp.Checkpointer(ocp.JsonCheckpointHandler()) as writer:
-        writer.save(folder / "meta", _meta(step, config, provenance))
+        writer.save(folder / "meta", checkpoint_meta.describe(step, config, provenance))
     integrity.seal(folder)
     return folder
 
@@ -240,7 +237,7 @@ def load_run(run: str | os.PathLike, which: int | str = "latest") -> LoadedRun:
         path = checkpoints / str(step)
         reason = integrity.damage(path)
         if reason is None:
-            meta = read_meta(path)
+            meta = checkpoint_meta.read(path)
             config = config_lib.Config.from_dict(meta["config"])
             variables = _restore_variables(path / "variables")
             return LoadedRun(config, world_model.WorldModel(config.model), variables, step, folder, meta["provenance"],
@@ -255,56 +252,12 @@ def load(run: str | os.PathLike) -> tuple[world_model.WorldModel, types.Variable
     return loaded.model, loaded.variables
 
 
-def check_architecture(wanted: config_lib.Config, stored: config_lib.Config, where: str) -> None:
-    """Raises ValueError naming both where the two configs describe different networks."""
-    if wanted.model == stored.model:
-        return
-    ours, theirs = dataclasses.asdict(wanted.model), dataclasses.asdict(stored.model)
-    fields = [f"{name} {theirs[name]!r} (stored) against {ours[name]!r} (asked for)"
-              for name in ours if ours[name] != theirs[name]]
-    raise ValueError(f"{where} holds another architecture: it is {stored.model.variant} of preset {stored.preset!r}, "
-                     f"asked for is {wanted.model.variant} of preset {wanted.preset!r}. Different: "
-                     f"{'; '.join(fields)}. Use the run's own settings, or a new --name.")
-
-
-def read_meta(folder: pathlib.Path) -> dict[str, Any]:
-    """The stored description of a checkpoint.
-
-    Raises:
-      ValueError: for an unknown schema version.
-    """
-    with ocp.Checkpointer(ocp.JsonCheckpointHandler()) as reader:
-        meta = reader.restore(folder / "meta")
-    if meta["schema_version"] != SCHEMA_VERSION:
-        raise ValueError(f"{folder} has checkpoint schema {meta['schema_version']}, this version reads "
-                         f"{SCHEMA_VERSION}. It was written by muvo_jax {meta['packages'].get('muvo_jax')}: use that.")
-    return meta
-
-
-def _meta(step: int, config: config_lib.Config, provenance: Mapping[str, Any] | None, data_state=None,
-          score: float | None = None) -> dict[str, Any]:
-    return {"schema_version": SCHEMA_VERSION, "step": step, "variant": config.model.variant,
-            "config": config.to_dict(), "contract": dataclasses.asdict(config.contract),
-            "packages": package_versions(), "provenance": dict(provenance or {}),
-            "data_state": _encode(data_state), "score": score}
-
-
-def package_versions() -> dict[str, str | None]:
-    """Versions of the packages that a run depends on; None where a package is not installed as one."""
-    def version(name):
-        try:
-            return importlib.metadata.version(name)
-        except importlib.metadata.PackageNotFoundError:
-            return None
-    return {name: version(name) for name in _PACKAGES}
-
-
 def _candidates(checkpoints: pathlib.Path, found: list[int], which: int | str) -> list[int]:
     newest_first = found[::-1]
     if which == "latest":
         return newest_first
     if which == "best":
-        scores = {step: read_meta(checkpoints / str(step))["score"] for step in newest_first
+        scores = {step: checkpoint_meta.read(checkpoints / str(step))["score"] for step in newest_first
                   if integrity.damage(checkpoints / str(step)) is None}
         scored = {step: score for step, score in scores.items() if score is not None}
         return [max(scored, key=scored.get)] if scored else newest_first  # type: ignore[arg-type]
@@ -338,15 +291,6 @@ def _abstract(leaf):
 def _steps(folder: pathlib.Path) -> list[int]:
     return sorted(int(path.name) for path in folder.iterdir() if path.is_dir() and path.name.isdigit()) \
         if folder.is_dir() else []
-
-
-def _encode(data_state):
-    return {"base64": base64.b64encode(data_state).decode()} if isinstance(data_state, bytes) else data_state
-
-
-def _decode(stored):
-    is_bytes = isinstance(stored, dict) and set(stored) == {"base64"}
-    return base64.b64decode(stored["base64"]) if is_bytes else stored
 
 
 def _first_line(error: BaseException) -> str:

@@ -18,8 +18,7 @@ import jax
 from muvo_jax import config as config_lib
 from muvo_jax import types
 from muvo_jax.data import pipeline, prepare, schema
-from muvo_jax.training import checkpoint, first_guess, host, integrity, preparation, run_folder, screen, validation
-from muvo_jax.training import state as state_lib
+from muvo_jax.training import checkpoint, checkpoint_meta, host, preparation, run_folder, screen, start, validation
 
 Preview = Callable[[pathlib.Path, validation.Validator, types.Variables, str], None]
 
@@ -74,7 +73,7 @@ def train(job: Job, show: screen.Screen) -> Outcome:
       NonFiniteLossError: where the loss is not finite.
     """
     if job.resume:
-        checkpoint.check_architecture(job.config, run_folder.read_config(job.folder), str(job.folder))
+        checkpoint_meta.check_architecture(job.config, run_folder.read_config(job.folder), str(job.folder))
     else:
         run_folder.check_new(job.folder, job.resume_command)
     with concurrent.futures.ThreadPoolExecutor(1, "preparation") as background:
@@ -87,13 +86,13 @@ def train(job: Job, show: screen.Screen) -> Outcome:
         ready = early.result()
         ready = preparation.recompile(ready, config, shapes) if ready else preparation.prepare(config, shapes)
     _introduce(job, show, config, ready, source.windows_per_epoch)
-    first = functools.partial(_first_state, job, show, config, ready, frames)
+    first = functools.partial(start.first, job.init, show, config, ready, frames)
     state, done, data_state = (None if job.resume else first()), 0, None
     if not job.resume:
         run_folder.create(job.folder, config, job.resume_command)
     keeper = checkpoint.Checkpoints(job.folder, keep_last=config.train.keep_last, keep_best=config.train.keep_best)
     if job.resume:
-        state, done, data_state = _resume(job, show, keeper, config, ready, first)
+        state, done, data_state = start.resume(keeper, show, config, ready, first)
     if data_state is not None:
         source = pipeline.train_batches(frames, seed=config.train.seed, batch=windows_per_step(config),
                                         start_state=data_state)
@@ -155,54 +154,6 @@ def _introduce(job: Job, show: screen.Screen, config: config_lib.Config, ready: 
     extra = f" x {accumulate} accumulated" if accumulate > 1 else ""
     show.field("steps", f"{config.train.steps} of {config.train.batch} windows{extra}, {ready.step.plan.describe()}")
     show.field("run", str(job.folder))
-
-
-def _resume(job: Job, show: screen.Screen, keeper: checkpoint.Checkpoints, config: config_lib.Config,
-            ready: preparation.Prepared, first: Callable[[], state_lib.TrainState]):
-    restored = keeper.restore_latest(ready.state, config)
-    if restored is None:
-        show.warn(f"{job.folder} has no checkpoint yet: training starts at step 0.")
-        run_folder.forget_after(job.folder, 0)
-        return first(), 0, None
-    for text in restored.warnings:
-        show.warn(text)
-    later = [step for step in keeper.steps() if step > restored.step]
-    for step in later:
-        moved = integrity.set_aside(keeper.folder / str(step), job.folder)
-        show.warn(f"moved the damaged checkpoint to {moved}.")
-    keeper.reload()
-    run_folder.forget_after(job.folder, restored.step)
-    show.field("resumed", f"from step {restored.step}")
-    return restored.state, restored.step, restored.data_state
-
-
-def _first_state(job: Job, show: screen.Screen, config: config_lib.Config, ready: preparation.Prepared,
-                 frames: pipeline.Frames) -> state_lib.TrainState:
-    """The state of step 0: weights of another run, or fresh ones."""
-    if job.init:
-        return _from_run(job.init, show, config, ready)
-    if config.model.first_guess == "training_mean":
-        return first_guess.fill(ready.state, validation.training_sums(frames), config.model, ready.step.plan)
-    return ready.state
-
-
-def _from_run(run: pathlib.Path, show: screen.Screen, config: config_lib.Config,
-              ready: preparation.Prepared) -> state_lib.TrainState:
-    """A state at step 0 with the weights of another run.
-
-    Raises:
-      CheckpointError: where it has none that can be read.
-      ValueError: where they belong to another network.
-    """
-    loaded = checkpoint.load_run(run)
-    for text in loaded.warnings:
-        show.warn(text)
-    shapes = lambda tree: jax.tree.map(lambda leaf: leaf.shape, tree)
-    numerics = (config.model.numerics, loaded.config.model.numerics)
-    if numerics[0] != numerics[1] or shapes(dict(loaded.variables)) != shapes(ready.state.variables):
-        checkpoint.check_architecture(config, loaded.config, str(run))
-    show.field("weights", f"of step {loaded.step} of {run}")
-    return ready.with_variables(loaded.variables, config)
 
 
 class _Run:

@@ -45,7 +45,6 @@ class Prepared:
         """How many numbers are learned."""
         return sum(leaf.size for leaf in jax.tree.leaves(self.state.params))
 
-
     def with_variables(self, variables: types.Variables, config: config_lib.Config) -> state_lib.TrainState:
         """`state` with other variables of the same shapes and a fresh optimiser."""
         optimizer = optimizer_lib.make_optimizer(config.optimizer, config.train.steps)

@@ -17,7 +17,7 @@ import muvo_jax
 from muvo_jax import config as config_lib
 from muvo_jax import presets
 from muvo_jax.model import world_model
-from muvo_jax.training import checkpoint, integrity, optimizer, run_folder, state
+from muvo_jax.training import checkpoint, checkpoint_meta, integrity, optimizer, run_folder, state
 
 ROOT = pathlib.Path(muvo_jax.__file__).parents[1]
 
@@ -164,7 +164,7 @@ def test_loading_what_is_not_there_says_what_was_expected(tmp_path):
 
 
 def test_an_unknown_schema_names_the_version_that_wrote_it(tmp_path, fresh, config, monkeypatch):
-    monkeypatch.setattr(checkpoint, "SCHEMA_VERSION", 99)
+    monkeypatch.setattr(checkpoint_meta, "SCHEMA_VERSION", 99)
     _save(tmp_path, fresh, config, 1).close()
     monkeypatch.undo()
     with pytest.raises(ValueError, match="checkpoint schema 99, this version reads 1"):

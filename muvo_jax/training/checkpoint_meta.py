@@ -1,0 +1,73 @@
+"""What a checkpoint says of itself: schema, configuration, action contract, package versions, position in the data."""
+
+from __future__ import annotations
+
+import base64
+import dataclasses
+import importlib.metadata
+import pathlib
+from collections.abc import Mapping
+from typing import Any
+
+import orbax.checkpoint as ocp
+
+from muvo_jax import config as config_lib
+
+SCHEMA_VERSION = 1
+_PACKAGES = ("muvo_jax", "jax", "jaxlib", "flax", "optax", "orbax-checkpoint", "numpy")
+
+
+def describe(step: int, config: config_lib.Config, provenance: Mapping[str, Any] | None, data_state=None,
+             score: float | None = None) -> dict[str, Any]:
+    """What is stored, as JSON types; arguments as `checkpoint.Checkpoints.save`."""
+    return {"schema_version": SCHEMA_VERSION, "step": step, "variant": config.model.variant,
+            "config": config.to_dict(), "contract": dataclasses.asdict(config.contract),
+            "packages": package_versions(), "provenance": dict(provenance or {}),
+            "data_state": _encode(data_state), "score": score}
+
+
+def read(folder: pathlib.Path) -> dict[str, Any]:
+    """The stored description of a checkpoint.
+
+    Raises:
+      ValueError: for an unknown schema version.
+    """
+    with ocp.Checkpointer(ocp.JsonCheckpointHandler()) as reader:
+        meta = reader.restore(folder / "meta")
+    if meta["schema_version"] != SCHEMA_VERSION:
+        raise ValueError(f"{folder} has checkpoint schema {meta['schema_version']}, this version reads "
+                         f"{SCHEMA_VERSION}. It was written by muvo_jax {meta['packages'].get('muvo_jax')}: use that.")
+    return meta
+
+
+def read_data_state(meta: Mapping[str, Any]) -> Any:
+    """The position in the data as it was given to `describe`; None where none was."""
+    stored = meta["data_state"]
+    is_bytes = isinstance(stored, dict) and set(stored) == {"base64"}
+    return base64.b64decode(stored["base64"]) if is_bytes else stored
+
+
+def _encode(data_state):
+    return {"base64": base64.b64encode(data_state).decode()} if isinstance(data_state, bytes) else data_state
+
+
+def check_architecture(wanted: config_lib.Config, stored: config_lib.Config, where: str) -> None:
+    """Raises ValueError naming both where the two configs describe different networks."""
+    if wanted.model == stored.model:
+        return
+    ours, theirs = dataclasses.asdict(wanted.model), dataclasses.asdict(stored.model)
+    fields = [f"{name} {theirs[name]!r} (stored) against {ours[name]!r} (asked for)"
+              for name in ours if ours[name] != theirs[name]]
+    raise ValueError(f"{where} holds another architecture: it is {stored.model.variant} of preset {stored.preset!r}, "
+                     f"asked for is {wanted.model.variant} of preset {wanted.preset!r}. Different: "
+                     f"{'; '.join(fields)}. Use the run's own settings, or a new --name.")
+
+
+def package_versions() -> dict[str, str | None]:
+    """Versions of the packages that a run depends on; None where a package is not installed as one."""
+    def version(name):
+        try:
+            return importlib.metadata.version(name)
+        except importlib.metadata.PackageNotFoundError:
+            return None
+    return {name: version(name) for name in _PACKAGES}

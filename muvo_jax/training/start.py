@@ -1,0 +1,83 @@
+"""The state that a run starts from: a fresh one, another run's weights, or what its newest checkpoint holds."""
+
+from __future__ import annotations
+
+import pathlib
+from collections.abc import Callable
+from typing import Any
+
+import jax
+
+from muvo_jax import config as config_lib
+from muvo_jax.data import pipeline
+from muvo_jax.training import (
+    checkpoint,
+    checkpoint_meta,
+    first_guess,
+    integrity,
+    preparation,
+    run_folder,
+    screen,
+    validation,
+)
+from muvo_jax.training import state as state_lib
+
+
+def first(init: pathlib.Path | None, show: screen.Screen, config: config_lib.Config, ready: preparation.Prepared,
+          frames: pipeline.Frames) -> state_lib.TrainState:
+    """The state of step 0: weights of the run `init`, or fresh ones.
+
+    Raises:
+      CheckpointError: where `init` has no checkpoint that can be read.
+      ValueError: where its weights belong to another network.
+    """
+    if init:
+        return _from_run(init, show, config, ready)
+    if config.model.first_guess == "training_mean":
+        return first_guess.fill(ready.state, validation.training_sums(frames), config.model, ready.step.plan)
+    return ready.state
+
+
+def resume(keeper: checkpoint.Checkpoints, show: screen.Screen, config: config_lib.Config, ready: preparation.Prepared,
+           make_first: Callable[[], state_lib.TrainState]) -> tuple[state_lib.TrainState, int, Any]:
+    """The newest readable checkpoint of a run, or `make_first()` where it has none yet.
+
+    Later checkpoints, all of them damaged, are set aside, and records of later steps are forgotten.
+
+    Returns:
+      state, steps done, position in the data (None: its start).
+
+    Raises:
+      CheckpointError: where there are checkpoints and none can be read.
+      ValueError: where they belong to another architecture.
+    """
+    folder = keeper.run_folder
+    restored = keeper.restore_latest(ready.state, config)
+    if restored is None:
+        show.warn(f"{folder} has no checkpoint yet: training starts at step 0.")
+        run_folder.forget_after(folder, 0)
+        return make_first(), 0, None
+    for text in restored.warnings:
+        show.warn(text)
+    later = [step for step in keeper.steps() if step > restored.step]
+    for step in later:
+        moved = integrity.set_aside(keeper.folder / str(step), folder)
+        show.warn(f"moved the damaged checkpoint to {moved}.")
+    keeper.reload()
+    run_folder.forget_after(folder, restored.step)
+    show.field("resumed", f"from step {restored.step}")
+    return restored.state, restored.step, restored.data_state
+
+
+def _from_run(run: pathlib.Path, show: screen.Screen, config: config_lib.Config,
+              ready: preparation.Prepared) -> state_lib.TrainState:
+    """A state at step 0 with the weights of another run."""
+    loaded = checkpoint.load_run(run)
+    for text in loaded.warnings:
+        show.warn(text)
+    shapes = lambda tree: jax.tree.map(lambda leaf: leaf.shape, tree)
+    numerics = (config.model.numerics, loaded.config.model.numerics)
+    if numerics[0] != numerics[1] or shapes(dict(loaded.variables)) != shapes(ready.state.variables):
+        checkpoint_meta.check_architecture(config, loaded.config, str(run))
+    show.field("weights", f"of step {loaded.step} of {run}")
+    return ready.with_variables(loaded.variables, config)

@@ -26,6 +26,10 @@ _SHORT = {"stride": 1, "context": 4, "horizon": 4, "frames": 8}
 _SIDE_MULTIPLE = 32
 # Targets that every recording has, or that are made of what it has; the others it must hold itself.
 _ALWAYS_THERE = frozenset({"image", "range_view", "occupancy", "action"})
+# Targets that are made of something recorded under another name, or brought to the model's size.
+_MADE_FROM = {"range_view_classes": "point_classes", "depth_m": "depth_m", "image_classes": "image_classes"}
+DEPTH_LIMIT_M = 100.0  # what is farther counts as nothing
+UNLABELLED = 255
 NAVIGATION = ("command", "next_command", "target_m", "next_target_m")
 
 PreparedFrame = dict[str, np.ndarray | np.generic]  # names and dtypes of types.Batch without B and T
@@ -90,16 +94,37 @@ def prepare_frame(raw: schema.RawFrame, config: config_lib.Config) -> PreparedFr
         ready["route_map"] = raw["route_map"]
     if model.speed:
         ready["speed_mps"] = raw["speed_mps"]
-    for name in ("reward", "is_terminal", *(model.targets.keys() - _ALWAYS_THERE)):
+    for name in ("reward", "is_terminal", *(model.targets.keys() - _ALWAYS_THERE - _MADE_FROM.keys())):
         if name in raw:
             ready[name] = raw[name]  # type: ignore[literal-required]
+    return ready | _labels(raw, model)
+
+
+def _labels(raw: schema.RawFrame, model: config_lib.ModelConfig) -> PreparedFrame:
+    """The targets of optional heads that must be brought to the model's sizes, as far as the frame has them."""
+    ready: PreparedFrame = {}
+    if "depth_m" in raw and "depth_m" in model.targets:
+        depth_m = camera_ops.resize_crop_nearest(raw["depth_m"], model.image_size)
+        ready["depth_m"] = np.where(depth_m < DEPTH_LIMIT_M, depth_m, range_view_ops.NO_RETURN_M).astype(np.float32)
+    if "image_classes" in raw and "image_classes" in model.targets:
+        ready["image_classes"] = camera_ops.resize_crop_nearest(raw["image_classes"], model.image_size)
+    if "point_classes" in raw and "range_view_classes" in model.targets:
+        winner = range_view_ops.nearest_points(raw["points_m"], model.range_view)
+        classes = np.append(raw["point_classes"], np.uint8(UNLABELLED))  # no point has the number -1
+        ready["range_view_classes"] = classes[winner]
     return ready
+
+
+def labels(model: config_lib.ModelConfig) -> frozenset[str]:
+    """Which of schema.LABELS the heads of a model learn from."""
+    return schema.LABELS & {_MADE_FROM.get(field, field) for field in model.targets}
 
 
 def check_targets(model: config_lib.ModelConfig, description: schema.RecordingDescription) -> None:
     """Raises DataError where a head cannot be trained: names the head, what the recording lacks, and the way out."""
     for head in model.heads:
-        for field in config_lib.TARGETS[head](model).keys() - _ALWAYS_THERE - description.modalities:
+        needed = {_MADE_FROM.get(field, field) for field in config_lib.TARGETS[head](model)}
+        for field in sorted(needed - _ALWAYS_THERE - description.modalities):
             others = ",".join(name for name in model.heads if name != head)
             raise schema.DataError(f"head {head!r} learns from {field}, which recording {description.name!r} does not "
                                    f"hold. Leave the head out (--heads={others}), or record {field}.")
@@ -148,6 +173,8 @@ def _fit_model(model: config_lib.ModelConfig, description: schema.RecordingDescr
     elif "occupancy" in heads:
         notes.append("no occupancy is recorded: the target is what each lidar scan hit and looked through, unknown "
                      "elsewhere.")
+    if description.classes:
+        changes["semantic_classes"] = len(description.classes)
     if model.route and "route_map" not in description.modalities:
         changes["route"] = False
         notes.append("no route map is recorded: the model has no route input.")

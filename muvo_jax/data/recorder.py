@@ -82,7 +82,8 @@ class RunWriter:
         Args:
           frame: frame_id (int) and timestamp_s; the other names of COLUMNS as far as they are known; and any of
             image uint8 [H, W, 3], depth_m float [H, W] (infinite in the sky), classes and route_map uint8 [H, W],
-            points_m float [N, 3] (with point_tags uint8 [N], what each hit), occupancy uint8 [X, Y, Z].
+            points_m float [N, 3] (with point_tags uint8 [N], what each hit), occupancy uint8 [X, Y, Z],
+            birds_eye_classes uint8 [X, Y] with birds_eye_instances int32 [X, Y].
 
         Raises:
           ValueError: where frame_id does not increase.
@@ -101,6 +102,10 @@ class RunWriter:
                 if name == "points_m" and "point_tags" in frame:
                     arrays["point_tags"] = np.asarray(frame["point_tags"], np.uint8)
                 self._path(folder, frame_id, ".npz").write_bytes(npz_bytes(arrays))
+        if "birds_eye_classes" in frame:
+            arrays = {"birds_eye_classes": np.asarray(frame["birds_eye_classes"], np.uint8),
+                      "birds_eye_instances": np.asarray(frame["birds_eye_instances"], np.int32)}
+            self._path("birds_eye", frame_id, ".npz").write_bytes(npz_bytes(arrays))
         self._rows.append([_cell(frame.get(name, "")) for name in COLUMNS])
 
     def close(self) -> None:

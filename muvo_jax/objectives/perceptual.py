@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -38,7 +39,8 @@ class FrozenEncoder:
     def maps(self, pictures: types.Array) -> list[types.Array]:
         """Maps of pictures float32 [..., H, W, 3] in [0, 1], leading axes merged."""
         flat = pictures.reshape(-1, *pictures.shape[-3:])
-        return self.network.apply(self.variables, camera.normalise_image(255.0 * flat), norm.Mode())
+        maps: Any = self.network.apply(self.variables, camera.normalise_image(255.0 * flat), norm.Mode())
+        return maps
 
     def distance_sums(self, prediction: types.Array, target: types.Array) -> PerceptualSums:
         """Sums of squared differences of each level, for pictures [..., H, W, 3] in [0, 1]."""

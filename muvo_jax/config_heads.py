@@ -19,6 +19,7 @@ from typing import Any, Literal
 
 HEADS = ("image", "range_view", "occupancy", "action")  # of the paper; the others are optional
 BIRDS_EYE_CLASSES = 8
+EGO_MOTION_UNITS = (1.0, 0.1, 0.05, 5.0)  # m forward, m left, rad, m/s: about what a step of 0.2 s brings
 Shapes = Mapping[str, tuple[int, ...]]
 
 # Head -> what a ModelConfig makes of it: Batch field -> its shape for one frame.
@@ -33,6 +34,9 @@ TARGETS: dict[str, Callable[[Any], Shapes]] = {
         "range_view_classes": (model.range_view.rows, model.range_view.columns)},
     "birds_eye": lambda model: {"birds_eye_classes": model.voxels.shape[:2],
                                 "birds_eye_instances": model.voxels.shape[:2]},
+    "reward": lambda model: {"reward": ()},
+    "continue": lambda model: {"is_terminal": ()},
+    "ego_motion": lambda model: {"ego_motion": (4,)},
 }
 ALL_HEADS = tuple(TARGETS)
 
@@ -50,6 +54,7 @@ class LossConfig:
     Of the optional heads: `depth` (L1), cross-entropies `semantic_image`, `semantic_range_view` and `birds_eye`, L2 of
     the `birds_eye_centre` map and, at the same weight at every scale, L1 of the `birds_eye_offset` in cells. The
     `*_weights` are of each class (empty: 1); of each frame only the `*_share` of the pixels predicted worst count.
+    `reward` is an L2, `continue_` a cross-entropy, `ego_motion` an L1 in EGO_MOTION_UNITS.
     """
 
     image: float = 0.1
@@ -70,6 +75,9 @@ class LossConfig:
     birds_eye: float = 0.1
     birds_eye_centre: float = 20.0
     birds_eye_offset: float = 0.01
+    reward: float = 1.0
+    continue_: float = 1.0
+    ego_motion: float = 0.1
     kl: float = 1e-3
     kl_balance: float = 0.75
     chamfer_points: int = 1024

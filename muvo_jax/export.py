@@ -29,7 +29,7 @@ from muvo_jax import command_line, types
 from muvo_jax import config as config_lib
 from muvo_jax.model import live as live_lib
 from muvo_jax.model import rollout, world_model
-from muvo_jax.training import checkpoint, preparation, screen
+from muvo_jax.training import checkpoint, screen
 
 PLATFORMS = ("cpu", "cuda")
 SIGNATURES = "signatures.json"
@@ -148,11 +148,9 @@ def functions(model: world_model.WorldModel, weights: Mapping[str, Any], config:
 
 
 def inputs(config: config_lib.Config) -> dict[str, jax.ShapeDtypeStruct]:
-    """What the model reads of one observation: field of Batch -> [...] without batch and time."""
-    batch = vars(preparation.expected_batch(config, 1))
-    unread = {"action", "is_first", "occupancy", "reward", "is_terminal", "intrinsics", "camera_to_ego"}
-    return {name: jax.ShapeDtypeStruct(leaf.shape[2:], leaf.dtype) for name, leaf in batch.items()
-            if leaf is not None and name not in unread}
+    """What the model reads of one observation: field of Batch -> [...] without batch and time, as live.observe_step."""
+    return {name: jax.ShapeDtypeStruct(shape, types.BATCH_FIELDS[name][0])
+            for name, shape in world_model.inputs(config.model).items()}
 
 
 def flatten(tree: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:

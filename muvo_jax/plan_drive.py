@@ -16,7 +16,7 @@ import tyro
 
 from muvo_jax import command_line, evaluate
 from muvo_jax import config as config_lib
-from muvo_jax.agents import closed_loop, environment, planners, rewards
+from muvo_jax.agents import closed_loop, environment, planners, rewards, sensitivity
 from muvo_jax.data import prepare
 from muvo_jax.data.town import record, settings, simulator
 from muvo_jax.metrics import protocol
@@ -37,8 +37,8 @@ class Options:
     """Drives in the built-in town closed loop: filter the sensors, plan in imagination, apply the first action, again.
 
     The expert drives while the model observes its first frames; then the planner takes over. The expert, coasting and
-    random actions drive the same seeds. Prints a table, writes plan_drive.json, plan_drive.md and plan_drive.gif (the
-    first planned drive).
+    random actions drive the same seeds. Also measures how far imagination answers to actions as the town does. Prints
+    tables, writes plan_drive.json, plan_drive.md and plan_drive.gif (the first planned drive).
     """
 
     run: Annotated[pathlib.Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
@@ -98,13 +98,19 @@ def plan_drive(options: Options, show: screen.Screen) -> dict[str, Any]:
             drives[name].append(closed_loop.drive(world, driver, key, seed, steps, context=context))
         show.line(f"{name}: {len(seeds)} drives, {time.perf_counter() - began_s:.0f} s so far", style="dim")
     scores = closed_loop.summarise(drives, EXPERT, town.config.route_m)
+    answers = sensitivity.measure(world, lambda state: town_truth(town, state), loaded.model, loaded.variables,
+                                  jax.random.key(options.seed), seeds, horizon=options.horizon, context=context)
+    show.line(f"sensitivity to actions, {time.perf_counter() - began_s:.0f} s so far", style="dim")
     report = {"run": str(loaded.folder), "step": loaded.step, "planner": options.planner, "horizon": options.horizon,
               "plans": options.plans, "iterations": options.iterations, "occupancy_scale": options.occupancy_scale,
               "step_s": world.step_s, "seconds": options.seconds, "seeds": seeds, "route_m": town.config.route_m,
-              "scores": scores, "drives": {name: [describe(one, seed) for one, seed in zip(runs, seeds, strict=True)]
-                                           for name, runs in drives.items()},
+              "scores": scores, "sensitivity": answers,
+              "drives": {name: [describe(one, seed) for one, seed in zip(runs, seeds, strict=True)]
+                         for name, runs in drives.items()},
               "packages": checkpoint_meta.package_versions()}
     show.console.print(screen_table(scores, options))
+    for line in sensitivity_rows(answers):
+        show.line(line)
     folder = options.out or loaded.folder / "plan_drive"
     folder.mkdir(parents=True, exist_ok=True)
     numbers, page = folder / "plan_drive.json", folder / "plan_drive.md"
@@ -160,6 +166,12 @@ def observation(seen, config: config_lib.Config) -> dict[str, Any]:
     return fields
 
 
+def town_truth(town: simulator.Town, state: simulator.TownState) -> dict[str, np.ndarray]:
+    """What the sensors show, and the occupancy, in the units of types.Batch."""
+    seen = town.render(state)
+    return {"image": seen["image"], "range_view": seen["range_view"], "occupancy": town.occupancy(seen)}
+
+
 def film(loaded: checkpoint.LoadedRun, town: simulator.Town, drive: closed_loop.Drive,
          options: Options) -> list[np.ndarray]:
     """Frames of a planned drive: the town, what the model makes of it, what it expects at the end of its plan."""
@@ -208,6 +220,13 @@ def screen_table(scores, options: Options) -> rich.table.Table:
     return table
 
 
+def sensitivity_rows(answers) -> list[str]:
+    """The sensitivity to actions as a Markdown table."""
+    return ["| response to | of | gain (1 is right, 0 ignores actions) | correlation |", "|---|---|---:|---:|",
+            *(f"| {contrast} | {head} | {score['gain']:.2f} | {score['correlation']:.2f} |"
+              for contrast, scores in answers.items() for head, score in scores.items())]
+
+
 def markdown(report) -> str:
     """The report as a page."""
     lines = [f"# {pathlib.Path(report['run']).name}: driving by imagination", "",
@@ -218,7 +237,10 @@ def markdown(report) -> str:
              "|---|" + "---:|" * len(COLUMNS)]
     lines += ["| " + " | ".join(row) + " |" for row in rows(report["scores"])]
     lines += ["", f"Success: driven to the end of the time without a collision and without leaving the route. Metres "
-                  f"count along the route until then; its whole length is {report['route_m']:g} m.", ""]
+                  f"count along the route until then; its whole length is {report['route_m']:g} m.", "",
+              "Does imagination answer to actions? From each takeover on, the same noise under two plans: the "
+              "difference that the model predicts between them, regressed on the town's.", "",
+              *sensitivity_rows(report["sensitivity"]), ""]
     return "\n".join(lines)
 
 

@@ -62,6 +62,8 @@ class Batch(_Indexable):
       birds_eye_instances: int32 [B, T, X, Y], the vehicle or pedestrian there, numbered from 1 in each frame; 0 none.
       reward: float32 [B, T].
       is_terminal: bool [B, T].
+      ego_motion: float32 [B, T, 4], forward and left (m) in the ego frame of the window's frame before, turn to the
+        left (rad) since then, and speed (m/s); the first three are meaningless where is_first.
       intrinsics: float32 [B, 3, 3], of the image as it is here, after resizing and cropping.
       camera_to_ego: float32 [B, 4, 4], camera frame (x right, y down, z forward) to ego frame.
     """
@@ -86,6 +88,7 @@ class Batch(_Indexable):
     next_target_m: ArrayLike | None = None
     reward: ArrayLike | None = None
     is_terminal: ArrayLike | None = None
+    ego_motion: ArrayLike | None = None
     intrinsics: ArrayLike | None = None
     camera_to_ego: ArrayLike | None = None
 
@@ -135,7 +138,8 @@ BATCH_FIELDS = {  # dtype, rank
     "route_map": (np.uint8, 4), "speed_mps": (np.float32, 2), "reward": (np.float32, 2),
     "depth_m": (np.float32, 4), "image_classes": (np.uint8, 4), "range_view_classes": (np.uint8, 4),
     "birds_eye_classes": (np.uint8, 4), "birds_eye_instances": (np.int32, 4),
-    "is_terminal": (np.bool_, 2), "intrinsics": (np.float32, 3), "camera_to_ego": (np.float32, 3),
+    "is_terminal": (np.bool_, 2), "ego_motion": (np.float32, 3), "intrinsics": (np.float32, 3),
+    "camera_to_ego": (np.float32, 3),
 }
 
 

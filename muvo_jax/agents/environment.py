@@ -126,12 +126,21 @@ class Environment:
         heads = self.decoded_heads
         missing = [head for head in heads if head not in self.model.config.heads]
         if missing:
-            raise ValueError(f"Environment: reward or observation read the head {', '.join(missing)}, but this run "
-                             f"trained {', '.join(self.model.config.heads)}; for a reward without occupancy pass "
-                             f"reward_config=RewardConfig(collision=0.0).")
-        if self.contract.kinematics != "bicycle" and self.reward_function is None:
-            raise ValueError(f"Environment: the driving reward needs the ego path, and contract.kinematics is "
-                             f"{self.contract.kinematics!r}; pass a reward_function of your own.")
+            names = ", ".join(missing)
+            raise ValueError(f"Environment: reward or observation read the head {names}, but this run trained "
+                             f"{', '.join(self.model.config.heads)}. Train it (--with-heads={','.join(missing)}); for "
+                             f"a reward without occupancy pass reward_config=RewardConfig(collision=0.0).")
+        if self.ego_path is None and self.reward_function is None:
+            raise ValueError(f"Environment: the driving reward needs the ego path, contract.kinematics is "
+                             f"{self.contract.kinematics!r}, and this run trained no head ego_motion. Train it "
+                             f"(--with-heads=ego_motion), or pass a reward_function of your own.")
+
+    @property
+    def ego_path(self) -> Literal["bicycle", "ego_motion"] | None:
+        """Where the imagined path comes from: the contract's kinematics, else the head, else there is none."""
+        if self.contract.kinematics == "bicycle":
+            return "bicycle"
+        return "ego_motion" if "ego_motion" in self.model.config.heads else None
 
     @property
     def step_s(self) -> float:
@@ -142,7 +151,8 @@ class Environment:
     def decoded_heads(self) -> tuple[str, ...]:
         """What every step decodes."""
         wanted = () if self.observation == "features" else tuple(self.observation)
-        return tuple(dict.fromkeys((*wanted, *self._reward_heads)))
+        path = ("ego_motion",) if self.ego_path == "ego_motion" else ()
+        return tuple(dict.fromkeys((*wanted, *self._reward_heads, *path)))
 
     @property
     def _reward_heads(self) -> tuple[str, ...]:
@@ -191,10 +201,12 @@ class Environment:
         batched = jax.tree.map(lambda leaf: jnp.expand_dims(leaf, 0), (noise, action, state.latent))
         latent, _ = self.model.imagine_step(params.variables, *batched)
         latent = latent[0]
-        motion = state.motion
-        if self.contract.kinematics == "bicycle":
-            motion = kinematics.drive(motion, action, self.contract, self.periods)
         full, for_reward = self._decode(params.variables, latent.features)
+        motion = state.motion
+        if self.ego_path == "bicycle":
+            motion = kinematics.drive(motion, action, self.contract, self.periods)
+        elif self.ego_path == "ego_motion":
+            motion = kinematics.moved(motion, full["ego_motion"])
         route_map = None if params.bank.route_map is None else params.bank.route_map[state.start]
         moment = rewards.Moment(state.motion, motion, action, latent.features, for_reward, route_map)
         reward, terminated, terms = self._reward(moment)
@@ -278,7 +290,12 @@ def play(environment: Environment, params: EnvParams, key: Array, state: EnvStat
     return states, transitions
 
 
-def make(model: WorldModel, config: config_lib.Config, **options: Any) -> Environment:
-    """The environment of a run: contract and stride come from its config; options as in Environment."""
+def make(model: WorldModel, config: config_lib.Config, *, learned_reward: bool = False, **options: Any) -> Environment:
+    """The environment of a run: contract and stride come from its config; options as in Environment.
+
+    `learned_reward` takes reward and ends from the heads reward and continue (rewards.learned_reward).
+    """
+    if learned_reward:
+        options |= {"reward_function": rewards.learned_reward, "reward_heads": rewards.LEARNED_HEADS}
     return Environment(model, contract=config.contract, periods=config.data.stride, **options)
 

@@ -1,8 +1,9 @@
-"""Where imagined actions take the car: the kinematic bicycle of the action contract, in JAX.
+"""Where imagined actions take the car: the kinematic bicycle of the action contract, or what a model predicts.
 
 The same equations as the town's simulator: a period of dt seconds changes the speed to v' = max(0, v + pedal dt),
 drives the distance d = (v + v') dt / 2, turns by -d tan(steering * steer_full) / wheelbase (steering > 0 is right), and
-moves along the mean of old and new heading.
+moves along the mean of old and new heading. Where a pedal is no acceleration (CARLA) the head ego_motion says how the
+car moved.
 """
 
 from __future__ import annotations
@@ -53,7 +54,7 @@ def drive(motion: Motion, action: Array, contract: config_lib.ActionContract, pe
     """
     if contract.kinematics != "bicycle":
         raise ValueError(f"contract.kinematics is {contract.kinematics!r}: the ego path follows from actions only with "
-                         f"'bicycle'; use the path of an ego-motion head or give the reward no path.")
+                         f"'bicycle'; otherwise use `moved` with a model that has the head ego_motion.")
     seconds = 1.0 / contract.rate_hz
     pedal_mps2, curvature = acceleration_mps2(action, contract), curvature_per_m(action, contract)
     pose, speed = motion.pose, motion.speed_mps
@@ -65,6 +66,14 @@ def drive(motion: Motion, action: Array, contract: config_lib.ActionContract, pe
         pose = pose + jnp.stack([distance * jnp.cos(heading), distance * jnp.sin(heading), turn], axis=-1)
         speed = new_speed
     return Motion(pose, speed)
+
+
+def moved(motion: Motion, ego_motion: Array) -> Motion:
+    """Applies a step [..., 4] as types.Batch.ego_motion and the head of that name have it; it brings its own speed."""
+    forward_m, left_m, turn_rad, speed_mps = jnp.moveaxis(ego_motion, -1, 0)
+    cosine, sine = jnp.cos(motion.pose[..., 2]), jnp.sin(motion.pose[..., 2])
+    step = jnp.stack([cosine * forward_m - sine * left_m, sine * forward_m + cosine * left_m, turn_rad], axis=-1)
+    return Motion(motion.pose + step, speed_mps)
 
 
 def path(start: Motion, actions: Array, contract: config_lib.ActionContract, periods: int = 1) -> Motion:

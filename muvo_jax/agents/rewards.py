@@ -183,10 +183,17 @@ def progress_m(moment: Moment, config: RewardConfig) -> Array:
     return driven * jnp.exp(-0.5 * (away / config.route_tolerance_m) ** 2)
 
 
-def discomfort(moment: Moment, contract: config_lib.ActionContract, config: RewardConfig) -> Array:
-    """(a_along / a_ok)^2 + (v^2 curvature / a_ok)^2: accelerations along and across in units of `comfortable_mps2`."""
-    along = kinematics.acceleration_mps2(moment.action, contract)
-    across = moment.after.speed_mps**2 * kinematics.curvature_per_m(moment.action, contract)
+def discomfort(moment: Moment, contract: config_lib.ActionContract, step_s: float, config: RewardConfig) -> Array:
+    """(a_along / a_ok)^2 + (v^2 curvature / a_ok)^2: accelerations along and across in units of `comfortable_mps2`.
+
+    Without a bicycle they come from the motion: change of speed and speed times turn, per second.
+    """
+    if contract.kinematics == "bicycle":
+        along = kinematics.acceleration_mps2(moment.action, contract)
+        across = moment.after.speed_mps**2 * kinematics.curvature_per_m(moment.action, contract)
+    else:
+        along = (moment.after.speed_mps - moment.before.speed_mps) / step_s
+        across = moment.after.speed_mps * (moment.after.pose[..., 2] - moment.before.pose[..., 2]) / step_s
     return (along**2 + across**2) / config.comfortable_mps2**2
 
 
@@ -210,7 +217,7 @@ def driving_reward(moment: Moment, *, grid: config_lib.VoxelGrid, contract: conf
     Returns:
       reward [...], terminated bool [...] (p above config.terminal_collision), and the terms by name.
     """
-    terms = {"progress_m": progress_m(moment, config), "discomfort": discomfort(moment, contract, config),
+    terms = {"progress_m": progress_m(moment, config), "discomfort": discomfort(moment, contract, step_s, config),
              "speeding": speeding(moment, config)}
     reward = (config.progress * terms["progress_m"] / (config.speed_limit_mps * step_s)
               - config.comfort * terms["discomfort"] - config.speeding * terms["speeding"])
@@ -220,3 +227,17 @@ def driving_reward(moment: Moment, *, grid: config_lib.VoxelGrid, contract: conf
         reward = reward - config.collision * terms["collision"]
         terminated = terms["collision"] > config.terminal_collision
     return reward, terminated, terms
+
+
+LEARNED_HEADS = ("reward", "continue")
+
+
+def learned_reward(moment: Moment) -> tuple[Array, Array, dict[str, Array]]:
+    """What the heads reward and continue learned from the recording: reward, and an end where going on is improbable.
+
+    Returns:
+      reward [...] in the recording's own unit, terminated bool [...] (probability of going on below one half), and that
+      probability as the term "continue".
+    """
+    going_on = jax.nn.sigmoid(moment.decoded["continue"][..., 0])
+    return moment.decoded["reward"][..., 0], going_on < 0.5, {"continue": going_on}

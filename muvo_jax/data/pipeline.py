@@ -16,7 +16,7 @@ import numpy as np
 
 from muvo_jax import config as config_lib
 from muvo_jax import types
-from muvo_jax.data import prepare, schema
+from muvo_jax.data import ego_motion, prepare, schema
 from muvo_jax.data import windows as windows_lib
 
 State = dict[str, Any]  # plain JSON types
@@ -62,6 +62,8 @@ class Frames:
                 for step, frame in enumerate(row):
                     values[index, step] = frame[name]
             fields[name] = values
+        if "ego_motion" in fields:
+            fields["ego_motion"] = ego_motion.between(fields["ego_motion"])
         is_first = np.zeros(fields["action"].shape[:2], bool)
         is_first[:, 0] = True
         return types.Batch(is_first=is_first, **fields).validate()

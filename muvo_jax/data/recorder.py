@@ -25,8 +25,7 @@ from muvo_jax.data import plain, schema
 
 COLUMNS = ("frame_id", "timestamp_s", "x_m", "y_m", "yaw_rad", "speed_mps", "acceleration", "steering", "reward",
            "is_terminal", "weather")
-DEPTH_UNIT_M = 0.01
-DEPTH_SKY = 65535
+DEPTH_UNIT_M, DEPTH_SKY = plain.DEPTH_UNIT_M, plain.DEPTH_SKY
 _IMAGES = ("image", "classes", "route_map")
 _ARRAYS = {"points_m": "lidar", "occupancy": "occupancy"}
 
@@ -132,7 +131,7 @@ def encode_depth(depth_m: np.ndarray) -> np.ndarray:
 
 def decode_depth(pixels: np.ndarray) -> np.ndarray:
     """The inverse of `encode_depth`: float32 metres, infinite in the sky."""
-    return np.where(pixels == DEPTH_SKY, np.float32(np.inf), pixels.astype(np.float32) * np.float32(DEPTH_UNIT_M))
+    return plain.decode_depth(pixels)
 
 
 def write_atomically(path: pathlib.Path, content: str | bytes) -> None:

@@ -37,10 +37,11 @@ class RawFrame(TypedDict, total=False):
       route_map: uint8 [64, 64].
       depth_m: float32 [H, W], along the optical axis, infinite in the sky; image_classes: uint8 [H, W], index into
         RecordingDescription.classes; point_classes: uint8 [N], of points_m; birds_eye_classes: uint8 [X, Y] and
-        birds_eye_instances: int32 [X, Y], on the ground plan of the voxels (muvo_jax.types.Batch). Only where asked for.
+        birds_eye_instances: int32 [X, Y], on the ground plan of the voxels (muvo_jax.types.Batch). Only if asked for.
       action: float32 [2], applied from this frame to the next.
       speed_mps, reward, is_terminal, timestamp_s: scalars.
       command, next_command: int32 scalars, 0 to 5; target_m, next_target_m: float32 [2] (muvo_jax.types.Batch).
+      pose: float64 [3], x, y (m) and yaw (rad) of the ego in a frame that stands still during the run.
       yaw_rate_radps: measured, left positive; for checks, no model sees it.
       frame_id: the recording's own number.
     """
@@ -57,6 +58,7 @@ class RawFrame(TypedDict, total=False):
     birds_eye_classes: np.ndarray
     birds_eye_instances: np.ndarray
     speed_mps: np.float32
+    pose: np.ndarray
     yaw_rate_radps: np.float32
     command: np.int32
     next_command: np.int32

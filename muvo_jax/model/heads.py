@@ -10,7 +10,7 @@ from collections.abc import Callable
 
 from flax import linen
 
-from muvo_jax.config import BIRDS_EYE_CLASSES, ModelConfig
+from muvo_jax.config import BIRDS_EYE_CLASSES, EGO_MOTION_UNITS, ModelConfig
 from muvo_jax.model import common, decoders, outputs, token_decoders, tokens
 
 
@@ -24,7 +24,7 @@ class Head:
       scales: what the decoder returns; 1 is full size.
       tokens: which group of the 2D latent the decoder reads (muvo_jax.model.tokens), None for one vector of all groups
         (tokens.pool); with the 1D latent it reads all features.
-      unit: factor from the network's output to the prediction (the range view comes out in metres).
+      unit: factor, or one a channel, from the network's output to the prediction (the range view comes out in metres).
       initial_bias: bias of the last layers of a fresh model, the network's first guess.
     """
 
@@ -32,7 +32,7 @@ class Head:
     channels: int | Callable[[ModelConfig], int]
     scales: tuple[int, ...]
     tokens: str | None
-    unit: Callable[[ModelConfig], float] = lambda config: 1.0
+    unit: Callable[[ModelConfig], float | tuple[float, ...]] = lambda config: 1.0
     initial_bias: float | None = None
 
     def channels_of(self, config: ModelConfig) -> int:
@@ -99,6 +99,9 @@ TABLE = {
     "semantic_range_view": Head(_range_view, _classes, (1, 2, 4), "range_view"),
     "birds_eye": Head(_birds_eye, BIRDS_EYE_CLASSES + decoders.INSTANCE_CHANNELS, (1, 2, 4), "occupancy"),
     "action": Head(_action, 2, (1,), "action"),
+    "reward": Head(_vector, 1, (1,), None),  # as recorded with the frame
+    "continue": Head(_vector, 1, (1,), None),  # logit of the drive not being over
+    "ego_motion": Head(_vector, 4, (1,), None, unit=lambda config: EGO_MOTION_UNITS),  # types.Batch.ego_motion
 }
 
 

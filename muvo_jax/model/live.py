@@ -11,7 +11,7 @@ import jax.numpy as jnp
 
 from muvo_jax.model import checks, rollout
 from muvo_jax.model.world_model import WorldModel
-from muvo_jax.types import Array, ArrayLike, Batch, LatentState, Variables
+from muvo_jax.types import UNTIMED_FIELDS, Array, ArrayLike, Batch, LatentState, Variables
 
 
 @flax.struct.dataclass
@@ -66,7 +66,8 @@ def observe_step(model: WorldModel, variables: Variables, live: LiveState, obser
         raise ValueError(f"observe_step: got previous_action {list(action.shape)}, expected [{batch_size}, 2].")
     checks.action_values(previous_action, "observe_step")
     checks.state(model, live.latent)
-    fields = {name: jnp.expand_dims(jnp.asarray(value), 1) for name, value in observation.items()}
+    fields = {name: jnp.asarray(value) if name in UNTIMED_FIELDS else jnp.expand_dims(jnp.asarray(value), 1)
+              for name, value in observation.items()}
     batch = Batch(action=jnp.expand_dims(action, 1), is_first=jnp.expand_dims(live.frame == 0, 1), **fields)
     return _observe_step(model, variables, live, batch.validate(), sampled)
 

@@ -21,7 +21,7 @@ from flax import linen
 from muvo_jax.config import ModelConfig
 from muvo_jax.model import camera, fusion, heads, lidar, measurements, outputs, tokens, transition
 from muvo_jax.nn import init as init_lib
-from muvo_jax.nn import norm
+from muvo_jax.nn import layers, norm
 from muvo_jax.types import BATCH_FIELDS, UNTIMED_FIELDS, Batch, Gaussian, LatentState, Predictions, StepNoise, Variables
 
 ROUTE_MAP_SIZE = (64, 64)
@@ -271,6 +271,8 @@ def _finished(value: jax.Array, name: str, scale: int, config: ModelConfig) -> j
     if name == "range_view" and config.range_view_points == "beams":
         value = outputs.along_beams(value, scale, config)
     unit = heads.TABLE[name].unit(config)
+    if isinstance(unit, tuple):
+        return value * layers.per_channel(jnp.asarray(unit, jnp.float32), value.ndim)
     return value if unit == 1.0 else value * unit
 
 

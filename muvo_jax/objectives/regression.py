@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import flax.struct
+import jax
 import jax.numpy as jnp
 
 from muvo_jax import types
@@ -39,6 +40,11 @@ def l2_sums(prediction: types.Array, target: types.Array, mask: types.Array | No
     """Squared error summed over channels, to be averaged over every other axis; arguments as `l1_sums`."""
     error = jnp.square(prediction.astype(jnp.float32) - target.astype(jnp.float32))
     return _masked_sums(error.sum(axis=-1), mask)
+
+
+def binary_cross_entropy_sums(logits: types.Array, target: types.Array) -> MeanSums:
+    """-log of the probability sigmoid(+-logit) of what is the case; logits float [...], target bool [...]."""
+    return _masked_sums(jax.nn.softplus(jnp.where(target, -1.0, 1.0) * logits.astype(jnp.float32)), None)
 
 
 def _masked_sums(error: types.Array, mask: types.Array | None) -> MeanSums:

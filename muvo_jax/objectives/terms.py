@@ -145,6 +145,24 @@ def _birds_eye(inputs: Inputs) -> dict[str, Sums]:
     return sums
 
 
+def _reward(inputs: Inputs) -> dict[str, Sums]:
+    return {"reward": regression.l2_sums(inputs.predictions[1], inputs.truth("reward")[..., None])}
+
+
+def _continue(inputs: Inputs) -> dict[str, Sums]:
+    going_on = ~inputs.truth("is_terminal")
+    return {"continue": regression.binary_cross_entropy_sums(inputs.predictions[1][..., 0], going_on)}
+
+
+def _ego_motion(inputs: Inputs) -> dict[str, Sums]:
+    """The speed of every frame, the motion of those that have a frame before them in the window."""
+    unit = jnp.asarray(config_lib.EGO_MOTION_UNITS, jnp.float32).reshape(1, 1, -1)
+    prediction, target = inputs.predictions[1] / unit, inputs.truth("ego_motion") / unit
+    moved = ~jnp.asarray(inputs.batch.is_first)
+    return {"ego_motion": regression.l1_sums(prediction[..., :3], target[..., :3], moved),
+            "ego_speed": regression.l1_sums(prediction[..., 3:], target[..., 3:])}
+
+
 TABLE: dict[str, HeadTerms] = {
     "image": HeadTerms(_image, scaled("image", "image_squared", "image_similarity", "image_perceptual")),
     "range_view": HeadTerms(_range_view, scaled("range_xyz", "range_depth") | {"chamfer_1": ("chamfer", 1.0)}),
@@ -159,4 +177,7 @@ TABLE: dict[str, HeadTerms] = {
         scaled("semantic_range_view")),
     "birds_eye": HeadTerms(_birds_eye, scaled("birds_eye", "birds_eye_centre")
                            | {f"birds_eye_offset_{scale}": ("birds_eye_offset", 1.0) for scale in labels.SCALES}),
+    "reward": HeadTerms(_reward, single("reward")),
+    "continue": HeadTerms(_continue, {"continue": ("continue_", 1.0)}),
+    "ego_motion": HeadTerms(_ego_motion, single("ego_motion") | {"ego_speed": ("ego_motion", 1.0)}),
 }

@@ -100,5 +100,5 @@ def test_what_does_not_fit_is_refused():
     with pytest.raises(ValueError, match="reach from 2 to 2"):
         environment.step(jax.random.key(0), state, jnp.full((2,), 2.0), params)
     none = dataclasses.replace(environment.contract, kinematics="none")
-    with pytest.raises(ValueError, match="pass a reward_function"):
+    with pytest.raises(ValueError, match="or pass a reward_function"):
         dataclasses.replace(environment, contract=none)

@@ -100,7 +100,7 @@ def test_progress_fades_with_the_distance_from_the_route():
 
 
 def test_comfort_and_speeding_by_hand():
-    discomfort = rewards.discomfort(moment(10.0, (-0.5, 0.1)), CONTRACT, CONFIG)
+    discomfort = rewards.discomfort(moment(10.0, (-0.5, 0.1)), CONTRACT, 0.2, CONFIG)
     speed = 10.0 - 0.2 * 3.0
     np.testing.assert_allclose(discomfort, (3.0**2 + (speed**2 * np.tan(0.06) / 2.9) ** 2) / 9.0, rtol=1e-5)
     np.testing.assert_allclose(rewards.speeding(moment(12.0), CONFIG), 0.2, rtol=1e-5)

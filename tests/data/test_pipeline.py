@@ -246,3 +246,24 @@ def test_prefetch_ends_with_its_iterator_and_reads_no_further_than_its_size():
     next(prefetch)
     prefetch.close()
     assert len(read) <= 6  # one handed out, two in the queue, one in the thread's hand, slack while closing
+
+
+def test_motion_since_the_frame_before_is_made_of_poses():
+    """At a stride of 2 the car has driven 2 m between frames, whatever the heading."""
+    recording = MemoryRecording([schema.Sequence("train", "a", 14, 16), schema.Sequence("val", "b", 40, 16)])
+    recording.description = dataclasses.replace(recording.description,
+                                                modalities=recording.description.modalities | {"pose"})
+    read, north = recording.read, np.pi / 2
+    recording.read = lambda sequence, index: read(sequence, index) | {
+        "pose": np.array([3.0, float(sequence.start + index), north])}
+    preset = presets.get("tiny")
+    model = dataclasses.replace(preset.model, heads=("action", "ego_motion"), speed=False)
+    config = dataclasses.replace(preset, model=model, data=dataclasses.replace(preset.data, frames=3, stride=2))
+    prepare.check_targets(model, recording.description)
+    frames = pipeline.Frames(recording, prepare.adapt(config, recording).config)
+    motion = next(pipeline.train_batches(frames, seed=0, batch=1)).ego_motion
+    np.testing.assert_allclose(motion[0, 1:, :3], [[2, 0, 0], [2, 0, 0]], atol=1e-6)
+    np.testing.assert_allclose(np.diff(motion[0, :, 3]), [2, 2])  # the speed of frame k is k
+    blind = dataclasses.replace(recording.description, modalities=frozenset({"speed_mps"}))
+    with pytest.raises(schema.DataError, match=r"head 'ego_motion' learns from pose.* \(--heads=action\)"):
+        prepare.check_targets(model, blind)

@@ -52,7 +52,7 @@ def ground_plan(pose: np.ndarray, boxes: box_lib.Boxes, ground: ground_lib.Groun
     count = 0
     for kind, material in ((_VEHICLE, box_lib.CAR_BODY), (_PEDESTRIAN, box_lib.PERSON)):
         for index in np.flatnonzero(near & (boxes.material == material)):
-            away_m, (forward, half_m) = flat_m - boxes.centre_m[index][None], (boxes.heading[index], boxes.half_m[index])
+            away_m, forward, half_m = flat_m - boxes.centre_m[index][None], boxes.heading[index], boxes.half_m[index]
             along_m, across_m = away_m @ forward, away_m @ np.array([-forward[1], forward[0]], np.float32)
             inside = (np.abs(along_m) <= half_m[0]) & (np.abs(across_m) <= half_m[1])
             if inside.any():

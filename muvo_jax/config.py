@@ -5,13 +5,15 @@ from __future__ import annotations
 import dataclasses
 from typing import Any, Literal
 
+from muvo_jax.config_augmentation import AugmentationConfig
 from muvo_jax.config_heads import ALL_HEADS, BIRDS_EYE_CLASSES, EGO_MOTION_UNITS, HEADS, TARGETS, LossConfig
 from muvo_jax.config_json import check_choice, override, override_all, parse
 from muvo_jax.geometry import BirdsEyeGrid, PillarGrid, RangeViewGeometry, VoxelGrid
 
-__all__ = ["ALL_HEADS", "BIRDS_EYE_CLASSES", "EGO_MOTION_UNITS", "HEADS", "TARGETS", "ActionContract", "BirdsEyeGrid",
-           "Config", "DataConfig", "EvaluationConfig", "LossConfig", "ModelConfig", "OptimizerConfig", "PillarGrid",
-           "RangeViewGeometry", "TrainConfig", "VoxelGrid", "override", "override_all", "parse"]
+__all__ = ["ALL_HEADS", "BIRDS_EYE_CLASSES", "EGO_MOTION_UNITS", "HEADS", "TARGETS", "ActionContract",
+           "AugmentationConfig", "BirdsEyeGrid", "Config", "DataConfig", "EvaluationConfig", "LossConfig",
+           "ModelConfig", "OptimizerConfig", "PillarGrid", "RangeViewGeometry", "TrainConfig", "VoxelGrid", "override",
+           "override_all", "parse"]
 
 FUSIONS = ("tr", "fc", "avg")
 LIDAR_ENCODERS = ("rv", "pp")
@@ -300,6 +302,7 @@ class Config:
     loss: LossConfig = LossConfig()
     optimizer: OptimizerConfig = OptimizerConfig()
     data: DataConfig = DataConfig()
+    augmentation: AugmentationConfig = AugmentationConfig()
     train: TrainConfig = TrainConfig()
     evaluation: EvaluationConfig = EvaluationConfig()
     contract: ActionContract = ActionContract()

@@ -98,12 +98,17 @@ def tiny() -> config_lib.Config:
     )
 
 
+# The authors train with changed images and routes.
+_AUGMENTED = config_lib.AugmentationConfig(image=True, route=True)
+
+
 def paper() -> config_lib.Config:
     """The paper's camera and lidar model (section IV): 12 frames, 6 of them observed, batch 16 by accumulation."""
     return config_lib.Config(
         preset="paper",
         model=config_lib.ModelConfig(heads=("image", "range_view", "action")),
         optimizer=config_lib.OptimizerConfig(accumulate=16),
+        augmentation=_AUGMENTED,
     )
 
 
@@ -115,6 +120,7 @@ def paper_occupancy() -> config_lib.Config:
     return config_lib.Config(
         preset="paper-occupancy",
         optimizer=config_lib.OptimizerConfig(accumulate=16),
+        augmentation=_AUGMENTED,
         data=config_lib.DataConfig(frames=6, context=4, horizon=2, town_size="tiny"),
     )
 
@@ -126,6 +132,7 @@ def _reference(preset: str, loss: config_lib.LossConfig, **model) -> config_lib.
         model=config_lib.ModelConfig(numerics="reference", **model),
         loss=dataclasses.replace(loss, occupancy_unknown="empty"),
         optimizer=config_lib.OptimizerConfig(accumulate=16),
+        augmentation=_AUGMENTED,
         data=config_lib.DataConfig(frames=6, context=6, horizon=10, town_size="tiny"),
         train=config_lib.TrainConfig(steps=100_000),
     )

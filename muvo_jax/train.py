@@ -58,6 +58,10 @@ class Options:
     """Predict occupancy, whatever the preset says."""
     no_occupancy: tyro.conf.FlagCreatePairsOff[bool] = False
     """Predict no occupancy."""
+    augment: tyro.conf.FlagCreatePairsOff[bool] = False
+    """Vary images and route maps that the encoders see in training, whatever the preset says."""
+    no_augment: tyro.conf.FlagCreatePairsOff[bool] = False
+    """Show them as they were recorded."""
     data: Annotated[str | None, command_line.shown("PATH")] = None
     """"town" (built in) or the folder of a recording; its kind is recognised."""
     data_camera: Annotated[str | None, command_line.shown("NAME", "the reader's choice")] = None
@@ -131,6 +135,11 @@ def configure(options: Options) -> tuple[config_lib.Config, dict[str, Any], path
     heads = _heads(options, chosen.get("model.heads", base.model.heads))
     if heads is not None:
         chosen["model.heads"] = heads
+    if options.augment or options.no_augment:
+        if options.augment and options.no_augment:
+            raise ValueError("--augment and --no-augment contradict each other: give one of them.")
+        for name in ("image", "route"):
+            chosen.setdefault(f"augmentation.{name}", options.augment)
     if chosen.get("model.fusion", "tr") != "tr" and base.model.latent == "2d":
         chosen.setdefault("model.latent", "1d")  # the only one that such a fusion has
     base = config_lib.override_all(base, chosen)

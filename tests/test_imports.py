@@ -10,13 +10,14 @@ import pytest
 import muvo_jax
 
 PACKAGE = pathlib.Path(muvo_jax.__file__).parent
-BASE = {"types", "config", "config_heads", "config_json", "geometry", "ops"}
+BASE = {"types", "config", "config_augmentation", "config_heads", "config_json", "geometry", "ops"}
 ALLOWED = {
     "types": set(),
+    "config_augmentation": set(),
     "config_heads": set(),
     "config_json": set(),
     "geometry": set(),
-    "config": {"config_heads", "config_json", "geometry"},
+    "config": {"config_augmentation", "config_heads", "config_json", "geometry"},
     "presets": {"config"},
     "ops": {"types", "config", "geometry"},
     "nn": BASE,

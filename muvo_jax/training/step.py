@@ -21,6 +21,7 @@ from muvo_jax import types
 from muvo_jax.metrics import image as image_metrics
 from muvo_jax.model import rollout, world_model
 from muvo_jax.objectives import total
+from muvo_jax.training import augmentation
 from muvo_jax.training import optimizer as optimizer_lib
 from muvo_jax.training import parallel as parallel_lib
 from muvo_jax.training import state as state_lib
@@ -171,7 +172,7 @@ def forward(params: Any, batch_stats: Any, batch: types.Batch, keys: types.Array
       batch: the local windows, leaves [b, T, ...].
       keys: typed keys [b].
       model, config: what to compute.
-      train: dropout, prior dropout and batch moments; otherwise none and running moments.
+      train: augmentation, dropout, prior dropout and batch moments; otherwise none of them and running moments.
       axis_name: mesh axis the batch is spread over, or None.
 
     Returns:
@@ -181,7 +182,10 @@ def forward(params: Any, batch_stats: Any, batch: types.Batch, keys: types.Array
     variables = {"params": params, "batch_stats": batch_stats}
     seen = min(config.train.observe_frames or batch.frames, batch.frames) if train else batch.frames
     observe = functools.partial(rollout.observe_window, model, train=train, axis_name=axis_name)
-    observed, batch_stats = maybe_remat(observe)(variables, batch.time_slice(0, seen), keys)
+    shown = batch.time_slice(0, seen)
+    if train:
+        shown = augmentation.augment(shown, keys, config.augmentation)
+    observed, batch_stats = maybe_remat(observe)(variables, shown, keys)
     features = observed.states.features
     if train:
         features = _and_imagined(model, variables, observed, batch.action, keys)

@@ -117,6 +117,7 @@ def make_config(accumulate=1, **model):
         config,
         model=dataclasses.replace(config.model, dropout=0.2, prior_dropout=0.5, **model),
         data=dataclasses.replace(config.data, frames=3),
+        augmentation=dataclasses.replace(config.augmentation, image=True),
         train=dataclasses.replace(config.train, batch=WINDOWS // accumulate, observe_frames=2, decode_frames=2),
         optimizer=dataclasses.replace(config.optimizer, accumulate=accumulate),
         loss=dataclasses.replace(config.loss, image_squared=0.1, chamfer=0.1, chamfer_points=16))

@@ -1,4 +1,4 @@
-"""A sealed world model (python -m muvo_jax.export RUN SEALED) at work without muvo_jax: python examples/sealed.py SEALED
+"""A sealed world model (python -m muvo_jax.export RUN SEALED) without muvo_jax: python examples/sealed.py SEALED
 
 Needs jax, flatbuffers and safetensors. It filters a stream of observations, here of zeros, then imagines braking and
 accelerating from the last one.

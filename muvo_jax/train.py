@@ -40,10 +40,10 @@ class Options:
     paper-occupancy (with voxels), reference-1d, reference-2d, reference-mobilevit (as the authors released them)."""
     variant: Annotated[str | None, command_line.shown("NAME")] = None
     """The paper's name of lidar, camera and fusion, such as PP-BEV-FC."""
-    lidar: Annotated[str | None, command_line.shown("{rv,pp}")] = None
-    """How points are read: rv (range view) or pp (PointPillars)."""
-    camera: Annotated[str | None, command_line.shown("{wob,bev}")] = None
-    """How images are read: wob (as they are) or bev (lifted to a bird's-eye view)."""
+    lidar: Annotated[str | None, command_line.shown("{rv,pp,none}")] = None
+    """How points are read: rv (range view), pp (PointPillars) or none (not at all)."""
+    camera: Annotated[str | None, command_line.shown("{wob,bev,none}")] = None
+    """How images are read: wob (as they are), bev (lifted to a bird's-eye view) or none (not at all)."""
     fusion: Annotated[str | None, command_line.shown("{tr,fc,avg}")] = None
     """How camera and lidar are fused: tr (transformer), fc (concatenation and a dense layer), avg (mean)."""
     latent: Annotated[str | None, command_line.shown("{1d,2d}")] = None

@@ -31,6 +31,10 @@ _PUBLISHED = {
     ("2d", True, "resnet18"): "basic_voxel (test_base_2d.yml)",
     ("2d", True, "mobilevitv2_100"): "mobilevit (test_mobilevit_2d.yml)",
 }
+_HEAD_PREFIXES = {"image": "rgb_decoder.", "range_view": "lidar_re.", "occupancy": "voxel_decoder.",
+                  "action": "policy.", "birds_eye": "bev_decoder."}
+Fields = dict[str, Any]  # of a ModelConfig
+ShapeOf = Callable[[str], tuple[int, ...]]
 
 
 class CheckpointMismatch(ValueError):
@@ -109,38 +113,80 @@ def published_name(model: config_lib.ModelConfig) -> str | None:
 def _describe(state_dict: Mapping[str, np.ndarray]) -> config_lib.ModelConfig:
     shape = lambda key: tuple(state_dict[key].shape)
     has = lambda prefix: any(key.startswith(prefix) for key in state_dict)
-    fields: dict[str, Any] = {"numerics": "reference", "latent": "2d" if has("rssm.prior.query_embed_image") else "1d"}
-    fields["heads"] = tuple(head for head, prefix in (
-        ("image", "rgb_decoder."), ("range_view", "lidar_re."), ("occupancy", "voxel_decoder."), ("action", "policy."))
-        if has(prefix))
-    fields["route"], fields["speed"] = has("backbone_route."), has("speed_enc.")
-    fields["backbone_width"] = shape("encoder.conv1.weight")[0]
-    fields["token_channels"] = shape("type_embedding")[2]
-    fields["transformer_hidden_channels"] = shape("transformer_encoder.layers.0.linear1.weight")[0]
-    fields["transformer_layers"] = _count(state_dict, r"^transformer_encoder\.layers\.(\d+)\.")
-    if fields["speed"]:
-        fields["measurement_channels"] = shape("speed_enc.0.weight")[0]
-    fields |= (_token_latent if fields["latent"] == "2d" else _vector_latent)(state_dict, shape, fields["heads"])
+    tokens = has("rssm.prior.query_embed_image")
+    fields: dict[str, Any] = {
+        "numerics": "reference", "latent": "2d" if tokens else "1d",
+        "fusion": "tr" if has("transformer_encoder.") else "fc", "camera": "bev" if has("depth_decoder.") else "wob",
+        "lidar": "pp" if has("point_pillars.") else "rv",
+        "heads": tuple(head for head, prefix in _HEAD_PREFIXES.items() if has(prefix)), "route": has("backbone_route."),
+        "navigation": has("command_encoder."), "speed": has("speed_enc.")}
+    fields |= _sensor_encoders(fields, state_dict, shape)
+    fields |= (_transformer_fusion if fields["fusion"] == "tr" else _pooled_fusion)(fields, state_dict, shape)
+    fields |= (_token_latent if tokens else _vector_latent)(fields, state_dict, shape)
     return config_lib.ModelConfig(**fields)
 
 
-def _vector_latent(state_dict: Mapping[str, np.ndarray], shape: Callable[[str], tuple[int, ...]],
-                   heads: tuple[str, ...]) -> dict[str, Any]:
-    fields: dict[str, Any] = {
-        "deterministic_channels": shape("rssm.pre_gru_net.0.weight")[0],
-        "stochastic_channels": shape("rssm.pre_gru_net.0.weight")[1],
-        "action_channels": shape("rssm.prior_action_module.0.weight")[0],
-        "embedding_channels": shape("features_combine.weight")[0],
-        "fused_channels": shape("image_feature_conv.0.conv1.weight")[0]}
+def _sensor_encoders(known: Fields, state_dict: Mapping[str, np.ndarray], shape: ShapeOf) -> Fields:
+    fields: Fields = {}
+    if "encoder.stem.conv.weight" in state_dict:
+        fields["backbone"] = "mobilevitv2_100"
+        fields["backbone_width"] = shape("encoder.stages_0.0.conv3_1x1.conv.weight")[0]
+    else:
+        fields["backbone_width"] = shape("encoder.conv1.weight")[0]
+    for key in ("speed_enc.0.weight", "gps_encoder.0.weight"):
+        if key in state_dict:
+            fields["measurement_channels"] = shape(key)[0]
+    if known["lidar"] == "pp":
+        fields["pillars"] = config_lib.PillarGrid(channels=shape("point_pillars.point_net.net.0.weight")[0])
+    if known["camera"] == "bev":
+        grid = dataclasses.replace(_birds_eye_grid(state_dict["frustum_pooling.bev_intrinsics"]),
+                                   depth_bins=shape("depth.weight")[0])
+        if "bev_down_sample_4.0.weight" in state_dict:
+            grid = dataclasses.replace(grid, hidden_channels=shape("bev_down_sample_4.0.weight")[0])
+        fields["birds_eye"] = grid
+    return fields
+
+
+def _birds_eye_grid(intrinsics: np.ndarray) -> config_lib.BirdsEyeGrid:
+    """The grid whose metres the matrix maps to cells; the usual one where the matrix is not filled in."""
+    per_m, behind, middle = (float(intrinsics[place]) for place in ((0, 0), (0, 2), (1, 2)))
+    if not per_m > 0.0:
+        return config_lib.BirdsEyeGrid()
+    return config_lib.BirdsEyeGrid(cells=round(2 * middle), cell_m=round(1 / per_m, 6), cells_behind=round(behind))
+
+
+def _transformer_fusion(known: Fields, state_dict: Mapping[str, np.ndarray], shape: ShapeOf) -> Fields:
+    lidar_decoder = "point_pillar_decoder" if known["lidar"] == "pp" else "range_view_decoder"
+    fields = {"token_channels": shape("type_embedding")[2],
+              "transformer_hidden_channels": shape("transformer_encoder.layers.0.linear1.weight")[0],
+              "transformer_layers": _count(state_dict, r"^transformer_encoder\.layers\.(\d+)\."),
+              "many_tokens": f"{lidar_decoder}.upsample_skip_convs.0.0.weight" in state_dict}
+    if known["latent"] == "1d":
+        fields["embedding_channels"] = shape("features_combine.weight")[0]
+        fields["fused_channels"] = shape("image_feature_conv.0.conv1.weight")[0]
+    return fields
+
+
+def _pooled_fusion(known: Fields, state_dict: Mapping[str, np.ndarray], shape: ShapeOf) -> Fields:
+    del known, state_dict
+    return {"map_channels": shape("feat_decoder.conv1.0.weight")[0],
+            "embedding_channels": shape("embedding_combine.weight")[0],
+            "fused_channels": shape("final_state_conv.0.conv1.weight")[0]}
+
+
+def _vector_latent(known: Fields, state_dict: Mapping[str, np.ndarray], shape: ShapeOf) -> Fields:
+    heads = known["heads"]
+    fields: Fields = {"deterministic_channels": shape("rssm.pre_gru_net.0.weight")[0],
+                      "stochastic_channels": shape("rssm.pre_gru_net.0.weight")[1],
+                      "action_channels": shape("rssm.prior_action_module.0.weight")[0]}
     for head, name in (("image", "rgb_decoder"), ("range_view", "lidar_re")):
         if head in heads:
             fields["decoder_channels"] = shape(f"{name}.linear.0.weight")[0]
-    if "image" in heads:
-        rows, columns = shape("rgb_decoder.pre_transpose_conv.0.weight")[2:]
-        fields["image_size"] = (64 * rows, 64 * columns)
-    if "range_view" in heads:
-        rows, columns = shape("lidar_re.pre_transpose_conv.0.weight")[2:]
-        fields["range_view"] = config_lib.RangeViewGeometry(rows=64 * rows, columns=64 * columns)
+            rows, columns = (64 * side for side in shape(f"{name}.pre_transpose_conv.0.weight")[2:])
+            fields |= ({"image_size": (rows, columns)} if head == "image" else
+                       {"range_view": config_lib.RangeViewGeometry(rows=rows, columns=columns)})
+    if "birds_eye" in heads:
+        fields["decoder_channels"] = shape("bev_decoder.constant_tensor")[0]
     if "occupancy" in heads:
         blocks = _count(state_dict, r"^voxel_decoder\.middle_conv\.(\d+)\.")
         fields["occupancy_blocks"] = blocks
@@ -150,20 +196,22 @@ def _vector_latent(state_dict: Mapping[str, np.ndarray], shape: Callable[[str], 
     return fields
 
 
-def _token_latent(state_dict: Mapping[str, np.ndarray], shape: Callable[[str], tuple[int, ...]],
-                  heads: tuple[str, ...]) -> dict[str, Any]:
+def _token_latent(known: Fields, state_dict: Mapping[str, np.ndarray], shape: ShapeOf) -> Fields:
+    heads = known["heads"]
     rows, columns = shape("rssm.prior.query_embed_lidar")[2:]
-    fields: dict[str, Any] = {
+    fields: Fields = {
         "image_size": tuple(32 * side for side in shape("rssm.prior.query_embed_image")[2:]),
         "range_view": config_lib.RangeViewGeometry(rows=16 * rows, columns=16 * columns),
         "transition_layers": _count(state_dict, r"^rssm\.prior\.module\.layers\.(\d+)\.")}
-    for head, name in (("image", "rgb_decoder"), ("range_view", "lidar_re")):
+    for head, name in (("image", "rgb_decoder"), ("range_view", "lidar_re"), ("birds_eye", "bev_decoder")):
         if head in heads:
             fields["decoder_channels"] = shape(f"{name}.pre_transpose_conv.0.weight")[0]
     stages = 1
     if "occupancy" in heads:
         stages = _count(state_dict, r"^voxel_decoder\.pre_transpose_conv\.(\d+)\.") // 2
         fields["occupancy_channels"] = shape("voxel_decoder.pre_transpose_conv.0.weight")[0] // 2
+    elif "birds_eye" in heads:
+        stages = _count(state_dict, r"^bev_decoder\.pre_transpose_conv\.(\d+)\.") - 2
     fields["occupancy_token_stages"] = stages
     fields["voxels"] = config_lib.VoxelGrid(
         tuple(side * 2 ** (stages + 3) for side in shape("rssm.prior.query_embed_voxel")[2:]))

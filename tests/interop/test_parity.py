@@ -163,8 +163,8 @@ def test_modules_of_the_1d_model():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name, file, entries", [("p3_1d", "p3_modules_1d.npz", 51),
-                                                 ("p3_2d", "p3_modules_2d.npz", 73)])
+@pytest.mark.parametrize("name, file, entries", [("p3_1d", "p3_modules_1d.npz", 61),
+                                                 ("p3_2d", "p3_modules_2d.npz", 82)])
 def test_whole_packs(name, file, entries):
     checks = next(checks for checks in registry.PACKS if checks.name == name)
     assert checked(name, file, checks.groups).passed == entries

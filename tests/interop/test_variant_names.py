@@ -1,13 +1,15 @@
-"""Every parameter of every variant of the reference has exactly one counterpart of the same shape here."""
+"""Every parameter of every variant of the reference has one counterpart of the same shape; both tell the variant."""
 
 import math
+import pathlib
 import re
 
 import jax
+import numpy as np
 import pytest
 
 from muvo_jax import config as config_lib
-from muvo_jax.interop import names, packs
+from muvo_jax.interop import checkpoints, names, packs
 from muvo_jax.model import world_model
 
 LIDAR_ONLY = ("range_view", "action")
@@ -28,7 +30,7 @@ VARIANTS = {
     "2d_RV_BEV_TR": {"latent": "2d", "camera": "bev"},
     "2d_PP_WOB_TR": {"latent": "2d", "lidar": "pp"},
     "2d_measurements": {"latent": "2d", "navigation": True},
-    "2d_bevseg": {"latent": "2d", "heads": ("range_view", "birds_eye", "action")},
+    "2d_bevseg": {"latent": "2d", "heads": ("range_view", "action", "birds_eye")},
     "2d_mobilevit": {"latent": "2d", "backbone": "mobilevitv2_100", "heads": config_lib.HEADS},
 }
 
@@ -50,3 +52,23 @@ def test_parameters_match_one_to_one(name):
     unused = "num_batches_tracked|encoder_layer|transformer_decoder_layer|bev_intrinsics"
     theirs = {key: math.prod(shape) for key, shape in packs.manifest(name).items() if not re.search(unused, key)}
     assert ours == theirs
+
+
+def stored(name, **filled):
+    """A checkpoint of the variant's keys and shapes, zeros but for what is given."""
+    zeros = {key: np.broadcast_to(np.float32(0), shape) for key, shape in packs.manifest(name).items()}
+    return checkpoints.Stored(pathlib.Path(name), zeros | filled, {}, {})
+
+
+@pytest.mark.parametrize("name", VARIANTS)
+def test_variants_are_recognised_by_their_keys_and_shapes(name):
+    model = checkpoints.recognise(stored(name))
+    assert model == reference_config(name)
+    released = {"1d_RV_WOB_TR_voxel", "1d_RV_WOB_TR_novoxel", "2d_RV_WOB_TR_voxel", "2d_mobilevit"}
+    assert (checkpoints.published_name(model) is not None) == (name in released)
+
+
+def test_the_grid_of_a_birds_eye_camera_comes_from_the_checkpoint():
+    matrix = np.array([[2.0, 0, 16], [0, -2.0, 32], [0, 0, 1]], np.float32)
+    grid = checkpoints.recognise(stored("RV_BEV_FC", **{"frustum_pooling.bev_intrinsics": matrix})).birds_eye
+    assert (grid.cells, grid.cell_m, grid.cells_behind) == (64, 0.5, 16)

@@ -21,6 +21,9 @@ class Check:
       tolerance: the largest error that passes.
       measure: (pack, entry, got) -> error; by default that of packs.Pack.error.
       stands_alone: whether the expected value lies elsewhere than in the pack (in `measure`).
+      again: where the function has kinks, the same value on weights that differ by rounding (drawing.rounded_anew): at
+        a kink it is chance on which side float32 comes out, in the reference too, so one of these may be its value.
+        They are asked for only where `got` misses the tolerance.
     """
 
     entry: str
@@ -28,6 +31,7 @@ class Check:
     tolerance: float
     measure: Callable[[packs.Pack, str, Any], float] = packs.Pack.error
     stands_alone: bool = False
+    again: Callable[[], Iterator[Any]] | None = None
 
 
 @dataclasses.dataclass(frozen=True)

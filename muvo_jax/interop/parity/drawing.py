@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
 import jax
@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from muvo_jax.interop import names, weights_rule
+from muvo_jax.model import heads
 from muvo_jax.nn import norm
 
 EVAL = norm.Mode()
@@ -46,6 +47,14 @@ def draw_variables(shapes: Any, prefix: str = "", where: str = "",
     return jax.tree_util.tree_map_with_path(draw, shapes)
 
 
+def rounded_anew(variables: Any, tries: int = 32) -> Iterator[Any]:
+    """The variables as rounding could have left them: times 1 + 1e-7 N(0, 1), as the packs' noise was measured."""
+    for seed in range(tries):
+        random = np.random.default_rng(seed)
+        noise = jax.tree.map(lambda leaf, random=random: 1e-7 * random.standard_normal(leaf.shape), variables)
+        yield jax.tree.map(lambda leaf, part: np.asarray(leaf * (1.0 + part), np.float32), variables, noise)
+
+
 def run(module, *args, prefix: str = "", where: str = "", rename: Callable[[str], str] | None = None,
         static: tuple = ()) -> Any:
     """Applies a module with drawn weights, jitted: module(*args, *static).
@@ -64,3 +73,13 @@ def run(module, *args, prefix: str = "", where: str = "", rename: Callable[[str]
 def run_method(module, method: Callable, variables: Any, *args) -> Any:
     """Applies method(bound module, *args), jitted."""
     return jax.jit(lambda variables, *inputs: module.apply(variables, *inputs, method=method))(variables, *args)
+
+
+def birds_eye_entries(prefix: str, scales: Mapping[int, jax.Array], axis: int) -> Iterator[tuple[str, np.ndarray]]:
+    """The reference's three outputs for each scale of our head "birds_eye", channels at `axis`."""
+    classes = heads.BIRDS_EYE_CLASSES
+    parts = {"segmentation": slice(0, classes), "instance_offset": slice(classes, classes + 2),
+             "instance_center": slice(classes + 2, classes + 3)}
+    for scale, value in scales.items():
+        for name, channels in parts.items():
+            yield f"{prefix}/bev_{name}_{scale}", channels_first(value[..., channels], axis)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pathlib
 from collections.abc import Iterator
 from typing import Any
 
@@ -10,30 +11,22 @@ import jax.numpy as jnp
 import numpy as np
 
 from muvo_jax import config as config_lib
-from muvo_jax.interop import reference_preprocess
+from muvo_jax.interop import checkpoints, packs, reference_preprocess
 from muvo_jax.interop.parity import cases, drawing, raw_batch
 from muvo_jax.model import rollout, world_model
+from muvo_jax.nn import mobilevit
 from muvo_jax.types import Predictions, StepNoise
 
 Checks = Iterator[cases.Check]
 TOLERANCE, BEV_TOLERANCE, STYLED_TOLERANCE = 1e-4, 1e-3, 1e-3
 _ENTRIES = {"image": "rgb", "range_view": "lidar_reconstruction", "occupancy": "voxel"}
-_LIDAR_ONLY = ("range_view", "action")
+_BACKBONES = {"encoder": "camera", "range_view_encoder": "lidar"}
 
 
 def config_of(name: str) -> config_lib.ModelConfig:
-    """The configuration of a pack by its name, such as "2d_RV_BEV_TR"."""
-    fields: dict[str, Any] = {"numerics": "reference", "heads": _LIDAR_ONLY}
-    parts = name.split("_")
-    if parts[0] == "2d":
-        fields["latent"] = "2d"
-    for field, choices in (("lidar", ("RV", "PP")), ("camera", ("WOB", "BEV")), ("fusion", ("TR", "FC"))):
-        fields[field] = next((choice.lower() for choice in choices if choice in parts), choices[0].lower())
-    if "voxel" in parts or "mobilevit" in parts:
-        fields["heads"] = config_lib.ModelConfig().heads
-    elif "novoxel" in parts:
-        fields["heads"] = ("image", "range_view", "action")
-    return config_lib.ModelConfig(**fields)
+    """The configuration of a pack's model, such as "2d_RV_BEV_TR", from the names and shapes of its weights."""
+    unfilled = {key: np.broadcast_to(np.float32(0), shape) for key, shape in packs.manifest(name).items()}
+    return checkpoints.recognise(checkpoints.Stored(pathlib.Path(name), unfilled, {}, {}))
 
 
 def tolerance_of(name: str, entry: str) -> float:
@@ -56,7 +49,10 @@ def _entries(context: cases.Context, config: config_lib.ModelConfig) -> Iterator
     frames, later = context.pack.shape("embedding")[1], context.settings.size("p4", "imagine")
     raw = raw_batch.draw_raw(context, frames, later)
     yield from ((f"in/{name}", value) for name, value in reference_preprocess.network_inputs(raw).items())
-    batch = raw_batch.model_batch(raw)
+    more = raw_batch.points(context, frames) if config.lidar == "pp" else {}
+    if config.navigation:
+        more |= raw_batch.navigation(context, frames)
+    batch = raw_batch.model_batch(raw, **more)
     model = world_model.WorldModel(config)
     variables = jax.tree.map(jnp.asarray, drawing.draw_variables(model.variable_shapes()))
     embedding, _ = jax.jit(model.encode)(variables, batch)
@@ -71,7 +67,8 @@ def _entries(context: cases.Context, config: config_lib.ModelConfig) -> Iterator
     yield from prediction_entries("out", predictions, config)
     for entry, column in (("throttle_brake", slice(0, 1)), ("steering", slice(1, 2))):
         yield f"deployment/{entry}", predictions["action"][1][:, -1:, column]
-    yield from _deployment(model, variables, embedding, batch)
+    if "deployment_forward/0/sample" in context.pack:
+        yield from _deployment(model, variables, embedding, batch)
     if "imagine/state" in context.pack:
         yield from _dream(model, variables, observed.last, jnp.asarray(raw["action"][:, frames:]), "imagine", later)
     if "imagine_policy/state" in context.pack:
@@ -94,8 +91,6 @@ def _dream(model: world_model.WorldModel, variables, state, driver, prefix: str,
 def _deployment(model: world_model.WorldModel, variables, embedding: jax.Array,
                 batch) -> Iterator[tuple[str, Any]]:
     """Three calls of the agent in CARLA at 10 Hz: the model moves at every second one, the third time unseeing."""
-    if model.config.latent == "2d":
-        return  # the reference's 2D model has no working deployment
     action = jnp.asarray(batch.action[:, -2])
     state = model.initial_state(1)
     zeros = jnp.zeros_like(state.stochastic)
@@ -118,6 +113,9 @@ def prediction_entries(prefix: str, predictions: Predictions,
             yield f"{prefix}/throttle_brake", scales[1][..., :1]
             yield f"{prefix}/steering", scales[1][..., 1:]
             continue
+        if head == "birds_eye":
+            yield from drawing.birds_eye_entries(prefix, scales, 2)
+            continue
         unit = config.range_scale_m if head == "range_view" else 1.0
         for scale, value in scales.items():
             yield f"{prefix}/{_ENTRIES.get(head, head)}_{scale}", drawing.channels_first(value, 2) / np.float32(unit)
@@ -128,4 +126,17 @@ def latent_layout(value: Any) -> np.ndarray:
     return np.swapaxes(value, 2, 3) if value.ndim == 4 else np.asarray(value)
 
 
+def mobilevit_backbones(context: cases.Context) -> Checks:
+    """The pyramids of the MobileViT-V2 model, on their own."""
+    width, image_size = 64, context.settings.size("p4", "mobilevit_backbone_image_hw")
+    for name, drawn, shape, levels in (("encoder", "mv_img", (3, *image_size), (2, 3, 4)),
+                                       ("range_view_encoder", "mv_rv", (4, *raw_batch.RANGE_SIZE), (1, 2, 3))):
+        image = drawing.channels_last(context.draw(drawn, (1, *shape), "smooth_pm1"))
+        maps = drawing.run(mobilevit.MobileVit(width, levels), image, where=f"{_BACKBONES[name]}/backbone/",
+                           static=(drawing.EVAL,))
+        for level, value in enumerate(maps):
+            yield cases.Check(f"{name}/feat{level}", drawing.channels_first(value), TOLERANCE)
+
+
 GROUPS: tuple[cases.Group, ...] = (checks,)
+BACKBONE_GROUPS: tuple[cases.Group, ...] = (mobilevit_backbones,)

@@ -33,14 +33,14 @@ def _last(array: Any, axis: int = 2) -> jax.Array:
     return jnp.moveaxis(jnp.asarray(array), axis, -1)
 
 
-def _loss(name: str, function: Callable[..., jax.Array], *args: np.ndarray, gradients: tuple[str, ...] = ("grad",),
-          tolerances: tuple[float, float] = (LOSS_TOLERANCE, GRADIENT_TOLERANCE)) -> Checks:
+def _loss(name: str, function: Callable[..., jax.Array], *args: np.ndarray,
+          gradients: tuple[str, ...] = ("grad",)) -> Checks:
     """Value and gradients of function(*args), one gradient for each of the first arguments."""
     arrays = [jnp.asarray(arg) for arg in args]
     value, slopes = jax.jit(jax.value_and_grad(function, argnums=tuple(range(len(gradients)))))(*arrays)
-    yield cases.Check(f"{name}/loss", value, tolerances[0])
+    yield cases.Check(f"{name}/loss", value, LOSS_TOLERANCE)
     for gradient, slope in zip(gradients, slopes, strict=True):
-        yield cases.Check(f"{name}/{gradient}", slope, tolerances[1])
+        yield cases.Check(f"{name}/{gradient}", slope, GRADIENT_TOLERANCE)
 
 
 def divergence(context: cases.Context) -> Checks:
@@ -228,17 +228,24 @@ def class_scores(context: cases.Context) -> Checks:
 
 
 def perceptual(context: cases.Context) -> Checks:
-    """Distances of a ResNet-18's maps of the normalised pictures."""
+    """Distances of a ResNet-18's maps of the normalised pictures. Its ReLUs are kinks of the gradient."""
     size = context.settings.size("p1", "perceptual_hw")
     prediction, target = (context.draw(f"perc_{side}", (1, 2, 3, *size), "smooth") for side in ("pred", "tgt"))
     network, weights = perceptual_network((2, *size, 3))
-    maps = lambda picture: perceptual_maps(network, weights, picture)
-    for level, value in enumerate(jax.jit(maps)(prediction)):
+    maps = lambda picture, weights: perceptual_maps(network, weights, picture)
+    for level, value in enumerate(jax.jit(maps)(prediction, weights)):
         yield cases.Check(f"perceptual_feat{level}", drawing.channels_first(value), PERCEPTUAL_TOLERANCES[0])
     for name, norm, style in (("l2", "l2", False), ("l1", "l1", False), ("l2_style", "l2", True)):
-        loss = lambda *pictures, norm=norm, style=style: reference_losses.feature_distance(
-            *(maps(picture) for picture in pictures), norm=norm, style=style)
-        yield from _loss(f"perceptual_{name}", loss, prediction, target, tolerances=PERCEPTUAL_TOLERANCES)
+        def distance(prediction, weights, norm=norm, style=style):
+            features, wanted = (maps(picture, weights) for picture in (prediction, target))
+            return reference_losses.feature_distance(features, wanted, norm=norm, style=style)
+
+        differentiate = jax.jit(jax.value_and_grad(distance))
+        again = lambda differentiate=differentiate: (differentiate(prediction, moved)[1]
+                                                     for moved in drawing.rounded_anew(weights))
+        value, slope = differentiate(prediction, weights)
+        yield cases.Check(f"perceptual_{name}/loss", value, PERCEPTUAL_TOLERANCES[0])
+        yield cases.Check(f"perceptual_{name}/grad", slope, PERCEPTUAL_TOLERANCES[1], again=again)
 
 
 def perceptual_network(shape: tuple[int, ...]) -> tuple[resnet.ResNet18, Any]:

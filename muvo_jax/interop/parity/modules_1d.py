@@ -11,7 +11,7 @@ import numpy as np
 
 from muvo_jax import config as config_lib
 from muvo_jax.interop.parity import cases, drawing
-from muvo_jax.model import decoders, rollout, world_model
+from muvo_jax.model import decoders, heads, rollout, world_model
 from muvo_jax.nn import attention, layers, pyramid, resnet
 from muvo_jax.types import StepNoise
 
@@ -38,8 +38,11 @@ def necks(context: cases.Context) -> Checks:
     sizes = context.settings.size("p3_1d", "fpn_hw")
     maps = [drawing.channels_last(context.draw(f"fpn{level}", (1, channels, *size), "smooth_pm1"))
             for level, (channels, size) in enumerate(zip(_FPN_CHANNELS, sizes, strict=True))]
-    out = drawing.run(pyramid.DownsamplingPyramid(CONFIG.token_channels), maps, where="camera/neck/", static=_EVAL)
-    yield cases.Check("DecoderDS/out", drawing.channels_first(out), TOLERANCE)
+    for name, prefix, neck in (("DecoderDS", "feat_decoder", pyramid.DownsamplingPyramid),
+                               ("Decoder", "feat_decoder_full", pyramid.UpsamplingPyramid)):
+        rename = lambda key, prefix=prefix: key.replace("feat_decoder", prefix)
+        out = drawing.run(neck(CONFIG.token_channels), maps, where="camera/neck/", rename=rename, static=_EVAL)
+        yield cases.Check(f"{name}/out", drawing.channels_first(out), TOLERANCE)
 
 
 def transformer(context: cases.Context) -> Checks:
@@ -94,6 +97,10 @@ def decoded(context: cases.Context) -> Checks:
             (voxels, state[:1], "decoders_occupancy/", "voxel_decoder/voxel", STYLED_TOLERANCE)):
         for scale, value in drawing.run(module, rows, where=where).items():
             yield cases.Check(f"{name}_{scale}", drawing.channels_first(value), tolerance)
+    head = heads.TABLE["birds_eye"]
+    birds_eye = drawing.run(head.build(CONFIG, head.channels), state[:1], where="decoders_birds_eye/")
+    for entry, value in drawing.birds_eye_entries("bev_decoder", birds_eye, 1):
+        yield cases.Check(entry, value, TOLERANCE)
 
 
 def recurrent(context: cases.Context) -> Checks:

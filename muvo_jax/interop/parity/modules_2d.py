@@ -10,7 +10,7 @@ import numpy as np
 from muvo_jax import config as config_lib
 from muvo_jax.interop import unused_modules
 from muvo_jax.interop.parity import cases, drawing, modules_1d
-from muvo_jax.model import decoders, token_decoders, token_transition
+from muvo_jax.model import decoders, heads, token_decoders, token_transition
 from muvo_jax.nn import resnet
 
 TOLERANCE, STYLED_TOLERANCE = modules_1d.TOLERANCE, modules_1d.STYLED_TOLERANCE
@@ -71,6 +71,12 @@ def decoded(context: cases.Context) -> Checks:
         for scale, value in drawing.run(module, tokens, where=where).items():
             tolerance = STYLED_TOLERANCE if name == "voxel_decoder" else TOLERANCE
             yield cases.Check(f"{name}/{entry}_{scale}", drawing.channels_first(value), tolerance)
+    birds_eye = token_decoders.TokenDecoder(heads.TABLE["birds_eye"].channels, width, width, 1,
+                                            head=decoders.BirdsEyeHead)  # the pack feeds the ground plan itself
+    plan = drawing.channels_last(context.draw("bev_decoder_in", (1, CONFIG.token_channels, 12, 12), "normal"))
+    for entry, value in drawing.birds_eye_entries("bev_decoder", drawing.run(
+            birds_eye, plan, where="decoders_birds_eye/"), 1):
+        yield cases.Check(entry, value, TOLERANCE)
     tokens = context.draw("pol_in", (3, CONFIG.token_channels), "normal")
     yield cases.Check("policy/out", drawing.run(decoders.ActionDecoder(), tokens, where="decoders_action/")[1],
                       TOLERANCE)

@@ -11,6 +11,7 @@ from muvo_jax.interop.parity import cases
 from muvo_jax.types import Batch
 
 IMAGE_SIZE, ROUTE_SIZE, RANGE_SIZE, VOXEL_SHAPE = (600, 960), (192, 192), (64, 1024), (192, 192, 64)
+POINTS, FEWER_POINTS = 60_000, 7_000
 
 
 def draw_raw(context: cases.Context, frames: int, later: int) -> dict[str, np.ndarray]:
@@ -27,6 +28,22 @@ def draw_raw(context: cases.Context, frames: int, later: int) -> dict[str, np.nd
                                   draw("full_steer", (1, frames + later, 1), "pm1")], axis=-1),
         "intrinsics": intrinsics,
     }
+
+
+def points(context: cases.Context, frames: int) -> dict[str, np.ndarray]:
+    """The scans as points, for the PP variants: fields of our batch. Each frame counts fewer points than the last."""
+    clouds = [context.draw(f"full_cloud_{frame}", (POINTS,), "cloud") for frame in range(frames)]
+    count = POINTS - FEWER_POINTS * np.arange(frames, dtype=np.int32)
+    return {"points": np.stack(clouds)[None].astype(np.float32), "point_count": count[None]}
+
+
+def navigation(context: cases.Context, frames: int) -> dict[str, np.ndarray]:
+    """What the route asks for, for the variants with measurements: fields of our batch."""
+    commands = {field: context.draw(name, (1, frames), "ints6").astype(np.int32)
+                for field, name in (("command", "full_cmd"), ("next_command", "full_cmd_next"))}
+    targets = {field: context.draw(name, (1, frames, 2), "pm1")
+               for field, name in (("target_m", "full_gps"), ("next_target_m", "full_gps_next"))}
+    return commands | targets
 
 
 def model_batch(raw: dict[str, np.ndarray], **more: Any) -> Batch:

@@ -2,10 +2,21 @@
 
 from __future__ import annotations
 
-from muvo_jax.interop.parity import cases, full_models, geometry, losses, modules_1d, modules_2d, p6
+from muvo_jax.interop import packs
+from muvo_jax.interop.parity import (
+    all_losses,
+    cases,
+    full_models,
+    geometry,
+    losses,
+    modules_1d,
+    modules_2d,
+    p6,
+    train_step,
+)
 
-# Any name that says sensors and fusion, such as 1d_RV_WOB_TR_voxel; and the two that say less.
-_FULL_MODELS = (r"(1d_|2d_)?(RV|PP)_(WOB|BEV)_(TR|FC)\w*\.npz", r"2d_(bevseg|measurements|mobilevit)\.npz")
+_BACKBONES = "mobilevitv2_100_backbones"
+_FULL_MODELS = tuple(rf"{name}\.npz" for name in packs.manifest_names() if name != _BACKBONES)
 
 PACKS = (
     cases.PackChecks("p1", (r"p1_losses_metrics\.npz",), losses.GROUPS),
@@ -13,5 +24,8 @@ PACKS = (
     cases.PackChecks("p3_1d", (r"p3_modules_1d\.npz",), modules_1d.GROUPS),
     cases.PackChecks("p3_2d", (r"p3_modules_2d\.npz",), modules_2d.GROUPS),
     cases.PackChecks("p4", _FULL_MODELS, full_models.GROUPS),
+    cases.PackChecks("p4_backbone", (r"mobilevitv2_100_backbone\.npz",), full_models.BACKBONE_GROUPS),
+    cases.PackChecks("p5_losses", (r"p5_losses_all_[12]d\.npz",), all_losses.GROUPS),
+    cases.PackChecks("p5_step", (r"p5_train_step_[12]d\.npz",), train_step.GROUPS),
     cases.PackChecks("p6", (r"p6_\w+\.npz",), p6.GROUPS, needs_recordings=True),
 )

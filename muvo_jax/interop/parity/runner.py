@@ -107,6 +107,14 @@ def _record(check: cases.Check, pack: packs.Pack, label: str, report: Report, wr
         error, note = check.measure(pack, check.entry, check.got), ""
     except ValueError as wrong_shape:
         error, note = math.inf, f"  ({wrong_shape})"
+    else:
+        if check.again is not None and error > check.tolerance:
+            computed = error
+            for tries, value in enumerate(check.again(), start=1):
+                error = min(error, check.measure(pack, check.entry, value))
+                if error <= check.tolerance:
+                    note = f"  ({computed:.1e} on this side of a kink, crossed in try {tries})"
+                    break
     passed = error <= check.tolerance
     report.passed += passed
     report.failed += not passed

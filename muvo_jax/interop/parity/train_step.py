@@ -1,0 +1,217 @@
+"""Packs p5: one training step of the whole model: loss terms, gradients, batch statistics, one AdamW update.
+
+Batch statistics in BatchNorm, no dropout, drawn latents. The optimiser of the pack has constant settings; the schedules
+with which the reference really trains are entries of their own.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Iterator
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+
+from muvo_jax import config as config_lib
+from muvo_jax import types
+from muvo_jax.interop import names, packs
+from muvo_jax.interop.parity import cases, drawing, full_models, raw_batch
+from muvo_jax.model import rollout, world_model
+from muvo_jax.objectives import regression, total
+from muvo_jax.training import optimizer as optimizer_lib
+
+Checks = Iterator[cases.Check]
+LOSS_TOLERANCE, STATISTICS_TOLERANCE, NORM_TOLERANCE, NEW_TOLERANCE = 1e-4, 1e-5, 5e-3, 1e-5
+STYLED_TOLERANCE, SCHEDULE_TOLERANCE = 5e-4, 1e-6
+_RATE = 1e-4
+_NOISY = ("encoder.", "range_view_encoder.", "feat_decoder.")
+_TERMS = {"image": "rgb", "range_xyz": "lidar_re", "range_depth": "lidar_depth", "occupancy_cross_entropy": "voxel",
+          "occupancy_semantic_scal": "sem_scal", "occupancy_geometric_scal": "geo_scal", "kl": "probabilistic"}
+
+
+def gradient_tolerance(key: str) -> float:
+    """Batch statistics over few samples and kinks of ReLU make the encoders' gradients the noisiest."""
+    if "query_embed" in key:
+        return 2e-2
+    return 5e-2 if key.startswith(_NOISY) else 5e-3
+
+
+def step(context: cases.Context) -> Checks:
+    try:
+        yield from _step(context)
+    finally:
+        jax.clear_caches()
+
+
+def _step(context: cases.Context) -> Checks:
+    latent = "2d" if context.pack.path.stem.endswith("2d") else "1d"
+    frames = context.pack.shape("out/throttle_brake")[1]
+    config = config_lib.ModelConfig(latent=latent, numerics="reference", dropout=0.0, prior_dropout=0.0)
+    model = world_model.WorldModel(config)
+    variables = jax.tree.map(jnp.asarray, drawing.draw_variables(model.variable_shapes()))
+    batch = raw_batch.model_batch(raw_batch.draw_raw(context, frames, 3))
+    noise = _noise(context, model, frames)
+    loss = loss_config(latent)
+
+    def forward(params, batch_stats, batch, noise):
+        weights = {"params": params, "batch_stats": batch_stats}
+        embedding, updated = model.encode(weights, batch, train=True)
+        observed = rollout.filter_embeddings(model, weights, embedding, jnp.asarray(batch.action),
+                                             jnp.asarray(batch.is_first), noise)
+        predictions: types.Predictions = {}
+        for head in config.heads:
+            decode = jax.checkpoint(lambda weights, features, head=head: model.decode(weights, features, (head,)))
+            predictions |= decode(weights, observed.states.features)
+        terms = total.losses(predictions, batch, observed, model=config, loss=loss,
+                             keys=jax.random.split(jax.random.key(0), 1))
+        return terms["total"], (terms, updated, observed, predictions)
+
+    differentiate = jax.jit(jax.value_and_grad(forward, has_aux=True))
+    (_, (terms, updated, observed, predictions)), gradients = differentiate(
+        variables["params"], variables["batch_stats"], batch, noise)
+    yield from _terms(terms, predictions, batch, config, loss)
+    yield from _outputs(observed, predictions, config)
+    yield from _statistics(context, updated)
+    yield from _gradients(context, gradients)
+    yield from _update(context, variables["params"], gradients)
+    yield from _groups(latent)
+
+
+def loss_config(latent: str) -> config_lib.LossConfig:
+    """The terms that the reference trains: its 2D code leaves out two of the occupancy terms."""
+    loss = config_lib.LossConfig(occupancy_unknown="empty")
+    return loss if latent == "1d" else dataclasses.replace(loss, occupancy_cross_entropy=0.0,
+                                                           occupancy_semantic_scal=0.0)
+
+
+def _noise(context: cases.Context, model: world_model.WorldModel, frames: int) -> types.StepNoise:
+    """Draw 2 t is the prior's of step t, draw 2 t + 1 the posterior's; tokens come before the batch."""
+    shape = model.initial_state(1).stochastic.shape
+    drawn = []
+    for index in range(2 * frames):
+        if len(shape) == 2:
+            drawn.append(context.draw(f"train_noise_{index}", shape, "normal"))
+        else:
+            tokens_first = context.draw(f"train_noise_{index}", (shape[1], 1, shape[2]), "normal")
+            drawn.append(np.swapaxes(tokens_first, 0, 1))
+    stack = lambda values: jnp.asarray(np.stack(values, 1))
+    return types.StepNoise(stack(drawn[0::2]), stack(drawn[1::2]), jnp.zeros((1, frames), bool))
+
+
+def _terms(terms: dict[str, jax.Array], predictions: types.Predictions, batch: types.Batch,
+           config: config_lib.ModelConfig, loss: config_lib.LossConfig) -> Checks:
+    yield cases.Check("loss/total", terms["total"], LOSS_TOLERANCE)
+    weights = total.term_weights(loss, config.heads)
+    for name, value in terms.items():
+        term, _, scale = name.rpartition("_")
+        entry = _TERMS.get(name) or f"{_TERMS.get(term, term)}_{scale}"
+        if name not in ("total", "action"):
+            yield cases.Check(f"loss/{entry}", weights[name] * value, LOSS_TOLERANCE)
+    for column, entry in enumerate(("throttle_brake", "steering")):
+        pick = lambda action, column=column: jnp.asarray(action)[..., column:column + 1]
+        value = regression.l1_sums(pick(predictions["action"][1]), pick(batch.action)).value()
+        yield cases.Check(f"loss/{entry}", loss.action * value, LOSS_TOLERANCE)
+
+
+def _outputs(observed: types.Observed, predictions: types.Predictions, config: config_lib.ModelConfig) -> Checks:
+    for kind, gaussian in (("prior", observed.prior), ("posterior", observed.posterior)):
+        for entry, value in (("mu", gaussian.mean), ("sigma", gaussian.std)):
+            yield cases.Check(f"out/{kind}/{entry}", full_models.latent_layout(value), LOSS_TOLERANCE)
+    for entry, value in full_models.prediction_entries("out", predictions, config):
+        yield cases.Check(entry, value, STYLED_TOLERANCE if "voxel" in entry else LOSS_TOLERANCE)
+
+
+def _statistics(context: cases.Context, batch_stats: Any) -> Checks:
+    for key, value in _by_reference_key({"batch_stats": batch_stats}):
+        module, _, moment = key.rpartition(".")
+        yield cases.Check(f"bn/{module}/{moment}", value, STATISTICS_TOLERANCE)
+
+
+def _gradients(context: cases.Context, gradients: Any) -> Checks:
+    squares: dict[str, float] = {}
+    for key, gradient in _by_reference_key({"params": gradients}):
+        module = key.split(".")[0]
+        squares[module] = squares.get(module, 0.0) + float(np.square(gradient, dtype=np.float64).sum())
+        if f"grad/{key}" in context.pack:
+            shaped = gradient.reshape(context.pack.shape(f"grad/{key}"))
+            yield cases.Check(f"grad/{key}", shaped, gradient_tolerance(key))
+    yield cases.Check("gradnorm/ALL", np.sqrt(sum(squares.values())), NORM_TOLERANCE)
+    for module, square in squares.items():
+        yield cases.Check(f"gradnorm/{module}", np.sqrt(square), NORM_TOLERANCE)
+
+
+def _update(context: cases.Context, params: Any, gradients: Any) -> Checks:
+    """One AdamW step with the reference's two groups; weight decay spares parameters with one axis."""
+    adamw = optax.adamw(_RATE, b1=0.9, b2=0.999, eps=1e-8, weight_decay=0.01,
+                        mask={"decayed": True, "undecayed": False})
+
+    @jax.jit
+    def update(params, gradients):
+        packed = optimizer_lib.pack(params)
+        updates, _ = adamw.update(optimizer_lib.pack(gradients), adamw.init(packed), packed)
+        return optimizer_lib.unpack(updates, params)
+
+    moved = dict(_by_reference_key({"params": update(params, gradients)}))
+    for key, before in _by_reference_key({"params": params}):
+        if f"new/{key}" in context.pack:
+            delta = moved[key].reshape(context.pack.shape(f"delta/{key}"))
+            yield cases.Check(f"new/{key}", before.reshape(delta.shape) + delta, NEW_TOLERANCE, _step_error)
+            yield cases.Check(f"delta/{key}", delta, gradient_tolerance(key), _step_error)
+
+
+def _step_error(pack: packs.Pack, entry: str, got: np.ndarray) -> float:
+    """The error where the sign of the gradient is known; infinite where a parameter moved further than it can.
+
+    The first step of Adam is as long as the learning rate whatever the size of the gradient, so where that is noise
+    the step may go either way. It is noise below a thousandth of the largest one (the page of the pack), and below the
+    tolerance of the gradient itself.
+    """
+    key = entry.partition("/")[2]
+    want, have = (value.astype(np.float64) for value in pack.stored(entry, got))
+    size = np.abs(pack.stored(f"grad/{key}", got)[0])
+    clear = size > max(1e-3, gradient_tolerance(key)) * size.max()
+    apart = np.abs(want - have)
+    if (apart > 2.01 * _RATE).any():
+        return math.inf
+    return float(apart[clear].max(initial=0.0) / max(np.abs(want).max(), 1e-6))
+
+
+def _groups(latent: str) -> Checks:
+    """How many of the reference's parameters each of AdamW's groups holds, by our rule for what is decayed."""
+    manifest = packs.manifest("2d_RV_WOB_TR_voxel" if latent == "2d" else "1d_RV_WOB_TR_voxel")
+    buffers = ("running_mean", "running_var", "num_batches_tracked")
+    shapes = [shape for key, shape in manifest.items() if not key.endswith(buffers)]
+    packed = optimizer_lib.group_of
+    yield cases.Check("groups/n_decay", sum(packed(len(shape)) == "decayed" for shape in shapes), 0.0)
+    yield cases.Check("groups/n_no_decay", sum(packed(len(shape)) == "undecayed" for shape in shapes), 0.0)
+
+
+def schedules(context: cases.Context) -> Checks:
+    """Learning rate and first momentum before each of some optimiser steps, relative to each value."""
+    for steps in (50_000, 100_000):
+        if f"onecycle_{steps}/step" not in context.pack:
+            continue
+        taken = context.pack[f"onecycle_{steps}/step"]
+        config = config_lib.OptimizerConfig()
+        yield cases.Check(f"onecycle_{steps}/step", taken, 0.0)
+        for entry, schedule in (("lr", optimizer_lib.learning_rate), ("beta1", optimizer_lib.beta1)):
+            values = np.asarray(jax.vmap(schedule(config, steps))(jnp.asarray(taken, jnp.int32)))
+            yield cases.Check(f"onecycle_{steps}/{entry}", values, SCHEDULE_TOLERANCE, _relative_error)
+
+
+def _relative_error(pack: packs.Pack, entry: str, got: np.ndarray) -> float:
+    return float(np.max(np.abs(got - pack[entry]) / np.abs(pack[entry])))
+
+
+def _by_reference_key(tree: dict[str, Any]) -> Iterator[tuple[str, np.ndarray]]:
+    """The reference's key and layout of every leaf of {"params": ...} or {"batch_stats": ...}."""
+    for path, leaf in jax.tree_util.tree_flatten_with_path(tree)[0]:
+        ours = "/".join(part.key for part in path[1:])
+        yield names.reference_key(ours), names.to_reference_layout(ours, np.asarray(leaf))
+
+
+GROUPS: tuple[cases.Group, ...] = (step, schedules)

@@ -52,8 +52,8 @@ class ModelConfig:
       fusion, lidar, camera, latent: the variant, see `variant`. Either lidar or camera may be "none": then the model
         does not see that sensor (its heads are another matter).
       numerics: "standard" follows the mathematics, "reference" the authors' code (DEVIATIONS.md lists the difference).
-      heads: what is decoded, of config_heads.TARGETS; a modality that the data lacks has no head. "birds_eye", classes
-        and instances on the ground plan of the voxels, is for converted models: no recording holds its targets.
+      heads: what is decoded, of config_heads.TARGETS; a modality that the data lacks has no head.
+      semantic_classes: of the heads semantic_image and semantic_range_view, as the recording counts them.
       route, speed: whether the planned route and the speed are inputs.
       navigation: whether the route's command, the next one and the GPS targets are inputs.
       backbone: of image and range view; pillars, route and the maps of fc and avg keep a ResNet-18.
@@ -91,6 +91,7 @@ class ModelConfig:
     latent: str = "1d"
     numerics: Literal["standard", "reference"] = "standard"
     heads: tuple[str, ...] = HEADS
+    semantic_classes: int = 10
     route: bool = True
     speed: bool = True
     navigation: bool = False

@@ -52,8 +52,8 @@ class ModelConfig:
       fusion, lidar, camera, latent: the variant, see `variant`. Either lidar or camera may be "none": then the model
         does not see that sensor (its heads are another matter).
       numerics: "standard" follows the mathematics, "reference" the authors' code (DEVIATIONS.md lists the difference).
-      heads: what is decoded, of config_heads.TARGETS; a modality that the data lacks has no head. "birds_eye", classes
-        and instances on the ground plan of the voxels, is for converted models: no recording holds its targets.
+      heads: what is decoded, of config_heads.TARGETS; a modality that the data lacks has no head.
+      semantic_classes: of the heads semantic_image and semantic_range_view, as the recording counts them.
       route, speed: whether the planned route and the speed are inputs.
       navigation: whether the route's command, the next one and the GPS targets are inputs.
       backbone: of image and range view; pillars, route and the maps of fc and avg keep a ResNet-18.
@@ -91,6 +91,7 @@ class ModelConfig:
     latent: str = "1d"
     numerics: Literal["standard", "reference"] = "standard"
     heads: tuple[str, ...] = HEADS
+    semantic_classes: int = 10
     route: bool = True
     speed: bool = True
     navigation: bool = False
@@ -260,6 +261,8 @@ class TrainConfig:
       observe_frames: so many frames of a training window are observed, the rest imagined from the last of them; 0
         observes all.
       parallel: "auto" uses shard_map over all devices where there is more than one.
+      backbone_weights: file of an image network that fresh encoders start from; "" for none.
+      perceptual_from: such a file, or a run whose image encoder is taken, for the perceptual term; "" for none.
     """
 
     steps: int = 50_000
@@ -276,6 +279,8 @@ class TrainConfig:
     remat: bool = False
     decode_frames: int = 0
     observe_frames: int = 0
+    backbone_weights: str = ""
+    perceptual_from: str = ""
 
 
 @dataclasses.dataclass(frozen=True)

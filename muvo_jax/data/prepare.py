@@ -26,8 +26,11 @@ _SHORT = {"stride": 1, "context": 4, "horizon": 4, "frames": 8}
 _SIDE_MULTIPLE = 32
 # Targets that every recording has, or that are made of what it has; the others it must hold itself.
 _ALWAYS_THERE = frozenset({"image", "range_view", "occupancy", "action"})
-# Targets that are made of other fields of a frame.
-_MADE_OF = {"ego_motion": frozenset({"pose", "speed_mps"})}
+# Targets that are made of other fields of a frame, or brought to the model's size.
+_MADE_OF = {"ego_motion": frozenset({"pose", "speed_mps"}), "range_view_classes": frozenset({"point_classes"}),
+            "depth_m": frozenset({"depth_m"}), "image_classes": frozenset({"image_classes"})}
+DEPTH_LIMIT_M = 100.0  # what is farther counts as nothing
+UNLABELLED = 255
 NAVIGATION = ("command", "next_command", "target_m", "next_target_m")
 
 PreparedFrame = dict[str, np.ndarray | np.generic]  # names and dtypes of types.Batch without B and T
@@ -95,20 +98,43 @@ def prepare_frame(raw: schema.RawFrame, config: config_lib.Config) -> PreparedFr
         ready["route_map"] = raw["route_map"]
     if model.speed:
         ready["speed_mps"] = raw["speed_mps"]
-    for name in ("reward", "is_terminal", *(model.targets.keys() - _ALWAYS_THERE)):
+    for name in ("reward", "is_terminal", *(model.targets.keys() - _ALWAYS_THERE - _MADE_OF.keys())):
         if name in raw:
             ready[name] = raw[name]  # type: ignore[literal-required]
     if "ego_motion" in model.targets:  # still in the frame of the run: motion begins with a second frame
         ready["ego_motion"] = np.array([*raw["pose"], raw["speed_mps"]])
+    return ready | _labels(raw, model)
+
+
+def _labels(raw: schema.RawFrame, model: config_lib.ModelConfig) -> PreparedFrame:
+    """The targets of optional heads that must be brought to the model's sizes, as far as the frame has them."""
+    ready: PreparedFrame = {}
+    if "depth_m" in raw and "depth_m" in model.targets:
+        depth_m = camera_ops.resize_crop_nearest(raw["depth_m"], model.image_size)
+        ready["depth_m"] = np.where(depth_m < DEPTH_LIMIT_M, depth_m, range_view_ops.NO_RETURN_M).astype(np.float32)
+    if "image_classes" in raw and "image_classes" in model.targets:
+        ready["image_classes"] = camera_ops.resize_crop_nearest(raw["image_classes"], model.image_size)
+    if "point_classes" in raw and "range_view_classes" in model.targets:
+        winner = range_view_ops.nearest_points(raw["points_m"], model.range_view)
+        classes = np.append(raw["point_classes"], np.uint8(UNLABELLED))  # where no point is, its number is -1
+        ready["range_view_classes"] = classes[winner]
     return ready
+
+
+def labels(model: config_lib.ModelConfig) -> frozenset[str]:
+    """Which of schema.LABELS the heads of a model learn from."""
+    return schema.LABELS & _recorded(model.targets)
+
+
+def _recorded(targets: Collection[str]) -> frozenset[str]:
+    """The keys of RawFrame that these targets are made of, without those that every recording has."""
+    return frozenset().union(*(_MADE_OF.get(field, {field}) for field in targets)) - _ALWAYS_THERE
 
 
 def check_targets(model: config_lib.ModelConfig, description: schema.RecordingDescription) -> None:
     """Raises DataError where a head cannot be trained: names the head, what the recording lacks, and the way out."""
     for head in model.heads:
-        fields = config_lib.TARGETS[head](model).keys() - _ALWAYS_THERE
-        needed = frozenset().union(*(_MADE_OF.get(field, {field}) for field in fields))
-        for field in sorted(needed - description.modalities):
+        for field in sorted(_recorded(config_lib.TARGETS[head](model).keys()) - description.modalities):
             others = ",".join(name for name in model.heads if name != head)
             raise schema.DataError(f"head {head!r} learns from {field}, which recording {description.name!r} does not "
                                    f"hold. Leave the head out (--heads={others}), or record {field}.")
@@ -159,6 +185,8 @@ def _fit_model(model: config_lib.ModelConfig, description: schema.RecordingDescr
     elif "occupancy" in heads:
         notes.append("no occupancy is recorded: the target is what each lidar scan hit and looked through, unknown "
                      "elsewhere.")
+    if description.classes:
+        changes["semantic_classes"] = len(description.classes)
     if model.route and "route_map" not in description.modalities:
         changes["route"] = False
         notes.append("no route map is recorded: the model has no route input.")

@@ -48,7 +48,7 @@ class Network(linen.Module):
             self.speed = measurements.SpeedEncoder(config)
         self.fusion = fusion.REGISTRY[config.fusion](config)
         self.transition = transition.REGISTRY[config.latent](config)
-        self.decoders = {name: head.build(config, head.channels) for name, head in heads.TABLE.items()
+        self.decoders = {name: head.build(config, head.channels_of(config)) for name, head in heads.TABLE.items()
                          if name in config.heads}
         if config.first_guess == "training_mean":
             self.first_guess = {name: outputs.FirstGuess() for name in outputs.FIRST_GUESS_HEADS

@@ -37,15 +37,27 @@ def tolerance_of(name: str, entry: str) -> float:
 
 
 def checks(context: cases.Context) -> Checks:
-    name = context.pack.path.stem
+    config = config_of(context.pack.path.stem)
     try:
-        for entry, value in _entries(context, config_of(name)):
-            yield cases.Check(entry, value, tolerance_of(name, entry))
+        drawn = drawing.draw_variables(world_model.WorldModel(config).variable_shapes())
+        yield from model_checks(context, config, drawn)
     finally:
         jax.clear_caches()  # one model at a time: the next one needs the memory
 
 
-def _entries(context: cases.Context, config: config_lib.ModelConfig) -> Iterator[tuple[str, Any]]:
+def model_checks(context: cases.Context, config: config_lib.ModelConfig, variables: Any) -> Checks:
+    """The entries of a pack by a model that is given, on the raw batch of the pack.
+
+    Args:
+      context: of the pack.
+      config: of the model.
+      variables: the pack's weights in our layout.
+    """
+    for entry, value in _entries(context, config, jax.tree.map(jnp.asarray, variables)):
+        yield cases.Check(entry, value, tolerance_of(context.pack.path.stem, entry))
+
+
+def _entries(context: cases.Context, config: config_lib.ModelConfig, variables: Any) -> Iterator[tuple[str, Any]]:
     frames, later = context.pack.shape("embedding")[1], context.settings.size("p4", "imagine")
     raw = raw_batch.draw_raw(context, frames, later)
     yield from ((f"in/{name}", value) for name, value in reference_preprocess.network_inputs(raw).items())
@@ -54,7 +66,6 @@ def _entries(context: cases.Context, config: config_lib.ModelConfig) -> Iterator
         more |= raw_batch.navigation(context, frames)
     batch = raw_batch.model_batch(raw, **more)
     model = world_model.WorldModel(config)
-    variables = jax.tree.map(jnp.asarray, drawing.draw_variables(model.variable_shapes()))
     embedding, _ = jax.jit(model.encode)(variables, batch)
     yield "embedding", latent_layout(embedding)
     key = jax.random.key(0)

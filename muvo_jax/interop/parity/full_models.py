@@ -15,7 +15,7 @@ from muvo_jax.interop import checkpoints, packs, reference_preprocess
 from muvo_jax.interop.parity import cases, drawing, raw_batch
 from muvo_jax.model import rollout, world_model
 from muvo_jax.nn import mobilevit
-from muvo_jax.types import Predictions, StepNoise
+from muvo_jax.types import Batch, Predictions, StepNoise
 
 Checks = Iterator[cases.Check]
 TOLERANCE, BEV_TOLERANCE, STYLED_TOLERANCE = 1e-4, 1e-3, 1e-3
@@ -53,21 +53,29 @@ def model_checks(context: cases.Context, config: config_lib.ModelConfig, variabl
       config: of the model.
       variables: the pack's weights in our layout.
     """
-    for entry, value in _entries(context, config, jax.tree.map(jnp.asarray, variables)):
-        yield cases.Check(entry, value, tolerance_of(context.pack.path.stem, entry))
-
-
-def _entries(context: cases.Context, config: config_lib.ModelConfig, variables: Any) -> Iterator[tuple[str, Any]]:
+    name = context.pack.path.stem
     frames, later = context.pack.shape("embedding")[1], context.settings.size("p4", "imagine")
     raw = raw_batch.draw_raw(context, frames, later)
-    yield from ((f"in/{name}", value) for name, value in reference_preprocess.network_inputs(raw).items())
+    for entry, value in reference_preprocess.network_inputs(raw).items():
+        yield cases.Check(f"in/{entry}", value, tolerance_of(name, f"in/{entry}"))
     more = raw_batch.points(context, frames) if config.lidar == "pp" else {}
     if config.navigation:
         more |= raw_batch.navigation(context, frames)
-    batch = raw_batch.model_batch(raw, **more)
-    model = world_model.WorldModel(config)
-    embedding, _ = jax.jit(model.encode)(variables, batch)
-    yield "embedding", latent_layout(embedding)
+    batch, model = raw_batch.model_batch(raw, **more), world_model.WorldModel(config)
+    variables = jax.tree.map(jnp.asarray, variables)
+    encode = jax.jit(lambda variables: model.encode(variables, batch)[0])
+    embedding = encode(variables)
+    # Which bins of depth are the most probable ones is a choice: another kink.
+    again = None if config.camera == "wob" else lambda: (latent_layout(encode(moved))
+                                                         for moved in drawing.rounded_anew(variables))
+    yield cases.Check("embedding", latent_layout(embedding), tolerance_of(name, "embedding"), again=again)
+    for entry, value in _entries(context, model, variables, batch, embedding, jnp.asarray(raw["action"][:, frames:])):
+        yield cases.Check(entry, value, tolerance_of(name, entry))
+
+
+def _entries(context: cases.Context, model: world_model.WorldModel, variables: Any, batch: Batch, embedding: jax.Array,
+             actions: jax.Array) -> Iterator[tuple[str, Any]]:
+    """What follows from the embedding: latents, predictions, deployment, dreams."""
     key = jax.random.key(0)
     observed = rollout.observe(model, variables, key, batch, sampled=False)
     for kind, gaussian in (("prior", observed.prior), ("posterior", observed.posterior)):
@@ -75,16 +83,16 @@ def _entries(context: cases.Context, config: config_lib.ModelConfig, variables: 
                              ("sigma", gaussian.std), ("sample", gaussian.mean)):
             yield f"out/{kind}/{entry}", latent_layout(value)
     predictions = rollout.decode(model, variables, observed.states)
-    yield from prediction_entries("out", predictions, config)
+    yield from prediction_entries("out", predictions, model.config)
     for entry, column in (("throttle_brake", slice(0, 1)), ("steering", slice(1, 2))):
         yield f"deployment/{entry}", predictions["action"][1][:, -1:, column]
     if "deployment_forward/0/sample" in context.pack:
         yield from _deployment(model, variables, embedding, batch)
     if "imagine/state" in context.pack:
-        yield from _dream(model, variables, observed.last, jnp.asarray(raw["action"][:, frames:]), "imagine", later)
+        yield from _dream(model, variables, observed.last, actions, "imagine", actions.shape[1])
     if "imagine_policy/state" in context.pack:
         policy = rollout.learned_policy(model, variables)
-        yield from _dream(model, variables, observed.last, policy, "imagine_policy", later)
+        yield from _dream(model, variables, observed.last, policy, "imagine_policy", actions.shape[1])
 
 
 def _dream(model: world_model.WorldModel, variables, state, driver, prefix: str,

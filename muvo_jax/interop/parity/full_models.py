@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import pathlib
 from collections.abc import Iterator
 from typing import Any
@@ -63,10 +64,10 @@ def model_checks(context: cases.Context, config: config_lib.ModelConfig, variabl
         more |= raw_batch.navigation(context, frames)
     batch, model = raw_batch.model_batch(raw, **more), world_model.WorldModel(config)
     variables = jax.tree.map(jnp.asarray, variables)
-    encode = jax.jit(lambda variables: model.encode(variables, batch)[0])
-    embedding = encode(variables)
+    encode = jax.jit(lambda variables, batch: model.encode(variables, batch)[0])
+    embedding = encode(variables, batch)
     # Which bins of depth are the most probable ones is a choice: another kink.
-    again = None if config.camera == "wob" else lambda: (latent_layout(encode(moved))
+    again = None if config.camera == "wob" else lambda: (latent_layout(encode(moved, batch))
                                                          for moved in drawing.rounded_anew(variables))
     yield cases.Check("embedding", latent_layout(embedding), tolerance_of(name, "embedding"), again=again)
     for entry, value in _entries(context, model, variables, batch, embedding, jnp.asarray(raw["action"][:, frames:])):
@@ -76,8 +77,10 @@ def model_checks(context: cases.Context, config: config_lib.ModelConfig, variabl
 def _entries(context: cases.Context, model: world_model.WorldModel, variables: Any, batch: Batch, embedding: jax.Array,
              actions: jax.Array) -> Iterator[tuple[str, Any]]:
     """What follows from the embedding: latents, predictions, deployment, dreams."""
-    key = jax.random.key(0)
-    observed = rollout.observe(model, variables, key, batch, sampled=False)
+    zeros = jnp.zeros((*embedding.shape[:2], *model.initial_state(1).stochastic.shape[1:]))
+    means = StepNoise(zeros, zeros, jnp.zeros(embedding.shape[:2], bool))
+    observed = jax.jit(functools.partial(rollout.filter_embeddings, model))(
+        variables, embedding, jnp.asarray(batch.action), jnp.asarray(batch.is_first), means)
     for kind, gaussian in (("prior", observed.prior), ("posterior", observed.posterior)):
         for entry, value in (("hidden_state", observed.states.deterministic), ("mu", gaussian.mean),
                              ("sigma", gaussian.std), ("sample", gaussian.mean)):

@@ -261,6 +261,8 @@ class TrainConfig:
       observe_frames: so many frames of a training window are observed, the rest imagined from the last of them; 0
         observes all.
       parallel: "auto" uses shard_map over all devices where there is more than one.
+      backbone_weights: file of an image network that fresh encoders start from; "" for none.
+      perceptual_from: such a file, or a run whose image encoder is taken, for the perceptual term; "" for none.
     """
 
     steps: int = 50_000
@@ -277,6 +279,8 @@ class TrainConfig:
     remat: bool = False
     decode_frames: int = 0
     observe_frames: int = 0
+    backbone_weights: str = ""
+    perceptual_from: str = ""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -18,6 +18,7 @@ __all__ = ["ALL_HEADS", "BIRDS_EYE_CLASSES", "EGO_MOTION_UNITS", "HEADS", "TARGE
 FUSIONS = ("tr", "fc", "avg")
 LIDAR_ENCODERS = ("rv", "pp")
 CAMERA_ENCODERS = ("wob", "bev")
+NO_SENSOR = "none"  # in place of an encoder
 LATENTS = ("1d", "2d")
 BACKBONES = ("resnet18", "mobilevitv2_100")
 
@@ -48,10 +49,11 @@ class ModelConfig:
     """The network. Defaults are the paper's size and the released 1D model (RV-WOB-TR with occupancy).
 
     Attributes:
-      fusion, lidar, camera, latent: the variant, see `variant`.
+      fusion, lidar, camera, latent: the variant, see `variant`. Either lidar or camera may be "none": then the model
+        does not see that sensor (its heads are another matter).
       numerics: "standard" follows the mathematics, "reference" the authors' code (DEVIATIONS.md lists the difference).
-      heads: what is decoded, of config_heads.TARGETS; a modality that the data lacks has no head. "birds_eye", classes
-        and instances on the ground plan of the voxels, is for converted models: no recording holds its targets.
+      heads: what is decoded, of config_heads.TARGETS; a modality that the data lacks has no head.
+      semantic_classes: of the heads semantic_image and semantic_range_view, as the recording counts them.
       route, speed: whether the planned route and the speed are inputs.
       navigation: whether the route's command, the next one and the GPS targets are inputs.
       backbone: of image and range view; pillars, route and the maps of fc and avg keep a ResNet-18.
@@ -89,6 +91,7 @@ class ModelConfig:
     latent: str = "1d"
     numerics: Literal["standard", "reference"] = "standard"
     heads: tuple[str, ...] = HEADS
+    semantic_classes: int = 10
     route: bool = True
     speed: bool = True
     navigation: bool = False
@@ -137,8 +140,8 @@ class ModelConfig:
         return f"{self.lidar}-{self.camera}-{self.fusion}".upper()
 
     def __post_init__(self):
-        for name, known in (("fusion", FUSIONS), ("lidar", LIDAR_ENCODERS), ("camera", CAMERA_ENCODERS),
-                            ("latent", LATENTS), ("backbone", BACKBONES)):
+        for name, known in (("fusion", FUSIONS), ("lidar", (*LIDAR_ENCODERS, NO_SENSOR)), ("latent", LATENTS),
+                            ("camera", (*CAMERA_ENCODERS, NO_SENSOR)), ("backbone", BACKBONES)):
             check_choice(f"model.{name}", getattr(self, name), known)
         for head in self.heads:
             check_choice("model.heads", head, ALL_HEADS)
@@ -164,6 +167,8 @@ class ModelConfig:
 
     def _check_variant(self):
         """Refuses combinations that make no sense."""
+        if self.lidar == self.camera == NO_SENSOR:
+            raise ValueError("model.lidar and model.camera are both none: a model needs one of them.")
         if self.fusion != "tr":
             for setting, chosen, why in (
                     ("latent=2d", self.latent == "2d", "the 2D latent is made of tokens, and only tr keeps tokens"),
@@ -256,6 +261,8 @@ class TrainConfig:
       observe_frames: so many frames of a training window are observed, the rest imagined from the last of them; 0
         observes all.
       parallel: "auto" uses shard_map over all devices where there is more than one.
+      backbone_weights: file of an image network that fresh encoders start from; "" for none.
+      perceptual_from: such a file, or a run whose image encoder is taken, for the perceptual term; "" for none.
     """
 
     steps: int = 50_000
@@ -272,6 +279,8 @@ class TrainConfig:
     remat: bool = False
     decode_frames: int = 0
     observe_frames: int = 0
+    backbone_weights: str = ""
+    perceptual_from: str = ""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -28,7 +28,12 @@ TARGETS: dict[str, Callable[[Any], Shapes]] = {
     "range_view": lambda model: {"range_view": (model.range_view.rows, model.range_view.columns, 4)},
     "occupancy": lambda model: {"occupancy": model.voxels.shape},
     "action": lambda model: {"action": (2,)},
-    "birds_eye": lambda model: {"birds_eye": model.voxels.shape[:2]},
+    "depth": lambda model: {"depth_m": model.image_size},
+    "semantic_image": lambda model: {"image_classes": model.image_size},
+    "semantic_range_view": lambda model: {
+        "range_view_classes": (model.range_view.rows, model.range_view.columns)},
+    "birds_eye": lambda model: {"birds_eye_classes": model.voxels.shape[:2],
+                                "birds_eye_instances": model.voxels.shape[:2]},
     "reward": lambda model: {"reward": ()},
     "continue": lambda model: {"is_terminal": ()},
     "ego_motion": lambda model: {"ego_motion": (4,)},
@@ -42,8 +47,14 @@ class LossConfig:
 
     `image` (L1), `image_squared` (L2, an addition to the paper), `range_xyz`, `range_depth` and `occupancy_*` apply per
     scale; 0 switches a term off. The Chamfer term looks at `chamfer_points` returns of each side; a predicted return is
-    a predicted range above `return_threshold_m`. `reward` (L2), `continue_` (cross-entropy) and `ego_motion` (L1 in
-    EGO_MOTION_UNITS) are of the optional heads.
+    a predicted range above `return_threshold_m`. Off by default are `image_similarity` (1 - structural similarity; the
+    reference's weight is 0.06 with the 1D latent, 0.03 with the 2D one), `image_perceptual` (0.1 there) and
+    `occupancy_dice`.
+
+    Of the optional heads: `depth` (L1), cross-entropies `semantic_image`, `semantic_range_view` and `birds_eye`, L2 of
+    the `birds_eye_centre` map and, at the same weight at every scale, L1 of the `birds_eye_offset` in cells. The
+    `*_weights` are of each class (empty: 1); of each frame only the `*_share` of the pixels predicted worst count.
+    `reward` is an L2, `continue_` a cross-entropy, `ego_motion` an L1 in EGO_MOTION_UNITS.
     """
 
     image: float = 0.1
@@ -55,6 +66,15 @@ class LossConfig:
     occupancy_geometric_scal: float = 0.1
     chamfer: float = 0.0
     action: float = 1.0
+    image_similarity: float = 0.0
+    image_perceptual: float = 0.0
+    occupancy_dice: float = 0.0
+    depth: float = 0.1
+    semantic_image: float = 0.1
+    semantic_range_view: float = 0.1
+    birds_eye: float = 0.1
+    birds_eye_centre: float = 20.0
+    birds_eye_offset: float = 0.01
     reward: float = 1.0
     continue_: float = 1.0
     ego_motion: float = 0.1
@@ -63,3 +83,8 @@ class LossConfig:
     chamfer_points: int = 1024
     return_threshold_m: float = 1.0
     occupancy_unknown: Literal["ignore", "empty"] = "ignore"
+    semantic_weights: tuple[float, ...] = ()
+    semantic_image_share: float = 1.0
+    semantic_range_view_share: float = 0.5
+    birds_eye_weights: tuple[float, ...] = (1.0, 1.0, 1.0, 2.0, 3.0, 1.0, 1.0, 1.0)
+    birds_eye_share: float = 0.25

@@ -55,6 +55,11 @@ class Batch(_Indexable):
       speed_mps: float32 [B, T].
       command, next_command: int32 [B, T], what the navigation says, 0 to 5, and what it will say then.
       target_m, next_target_m: float32 [B, T, 2], the places that the two commands belong to, seen from the ego.
+      depth_m: float32 [B, T, H, W], along the optical axis of `image`; -1 where nothing is near enough to be measured.
+      image_classes: uint8 [B, T, H, W], what each pixel shows; 255 unlabelled.
+      range_view_classes: uint8 [B, T, Hr, Wr], what each pixel of `range_view` hit; 255 where nothing returned.
+      birds_eye_classes: uint8 [B, T, X, Y], what lies on each cell of the ground plan of `occupancy`; 255 unknown.
+      birds_eye_instances: int32 [B, T, X, Y], the vehicle or pedestrian there, numbered from 1 in each frame; 0 none.
       reward: float32 [B, T].
       is_terminal: bool [B, T].
       ego_motion: float32 [B, T, 4], forward and left (m) in the ego frame of the window's frame before, turn to the
@@ -70,6 +75,11 @@ class Batch(_Indexable):
     points: ArrayLike | None = None
     point_count: ArrayLike | None = None
     occupancy: ArrayLike | None = None
+    depth_m: ArrayLike | None = None
+    image_classes: ArrayLike | None = None
+    range_view_classes: ArrayLike | None = None
+    birds_eye_classes: ArrayLike | None = None
+    birds_eye_instances: ArrayLike | None = None
     route_map: ArrayLike | None = None
     speed_mps: ArrayLike | None = None
     command: ArrayLike | None = None
@@ -126,6 +136,8 @@ BATCH_FIELDS = {  # dtype, rank
     "points": (np.float32, 4), "point_count": (np.int32, 2), "command": (np.int32, 2), "next_command": (np.int32, 2),
     "target_m": (np.float32, 3), "next_target_m": (np.float32, 3), "occupancy": (np.uint8, 5),
     "route_map": (np.uint8, 4), "speed_mps": (np.float32, 2), "reward": (np.float32, 2),
+    "depth_m": (np.float32, 4), "image_classes": (np.uint8, 4), "range_view_classes": (np.uint8, 4),
+    "birds_eye_classes": (np.uint8, 4), "birds_eye_instances": (np.int32, 4),
     "is_terminal": (np.bool_, 2), "ego_motion": (np.float32, 3), "intrinsics": (np.float32, 3),
     "camera_to_ego": (np.float32, 3),
 }

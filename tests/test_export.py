@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import pathlib
 import subprocess
 import sys
 
@@ -58,6 +59,10 @@ def test_a_sealed_model_gives_the_same_numbers_without_the_library(tmp_path):
     given |= {f"observation/{name}": value for name, value in observation.items()}
     np.savez(tmp_path / "given.npz", **given)
     subprocess.run([sys.executable, "-c", PROGRAM, str(tmp_path)], check=True, cwd=tmp_path)
+
+    example = pathlib.Path(__file__).parents[1] / "examples" / "sealed.py"
+    shown = subprocess.run([sys.executable, example, str(tmp_path)], check=True, cwd=tmp_path, capture_output=True)
+    assert b"decode_action after 3 steps: (2, 2)" in shown.stdout
 
     stream = live.observe_step(model, variables, stream, observation, given["previous_action"])
     dream = rollout.imagine(model, variables, keys, stream.latent, actions)

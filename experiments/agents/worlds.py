@@ -4,10 +4,9 @@ import jax
 import jax.numpy as jnp
 
 import muvo_jax
-from muvo_jax import command_line, presets
+from muvo_jax import presets
 from muvo_jax.agents import environment, rewards
-from muvo_jax.data import pipeline
-from muvo_jax.training import checkpoint, screen
+from muvo_jax.training import checkpoint
 
 
 def load(run: str | None, horizon: int) -> tuple[environment.Environment, environment.EnvParams]:
@@ -26,9 +25,7 @@ def load(run: str | None, horizon: int) -> tuple[environment.Environment, enviro
         return world, world.params(model.init(jax.random.key(0)), bank, horizon)
     loaded = checkpoint.load_run(run)
     config = loaded.config
-    frames = pipeline.Frames(command_line.open_data(config, screen.Screen()), config)
-    length = config.data.context + config.data.horizon
-    batch = next(iter(pipeline.evaluation_batches(frames, "train", windows=16, batch=16, length=length))).batch
+    batch = muvo_jax.windows(run, "train", count=16)
     observed = muvo_jax.observe(loaded.model, loaded.variables, jax.random.key(0), batch)
     world = environment.make(loaded.model, config)
     bank = environment.bank_of(observed, batch, skip=config.data.context - 1)

@@ -45,6 +45,8 @@ _ROUTE_PX = 64
 _MODES = ("train", "val0", "val1", "val2")
 # RawFrame key -> kind of file.
 _FILES = {"image": "image", "points_m": "points_semantic", "occupancy": "voxel", "route_map": "routemap"}
+_LABEL_FILES = {"depth_m": "depth_semantic", "image_classes": "depth_semantic", "point_classes": "points_semantic",
+                "birds_eye_classes": "birdview", "birds_eye_instances": "birdview"}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -109,12 +111,13 @@ class CarlaRecording:
     """A folder in the MUVO / MILE CARLA layout."""
 
     def __init__(self, path: pathlib.Path | str, *, min_mean_reward: float = MIN_MEAN_REWARD,
-                 skipped_s: float = SKIPPED_S):
+                 skipped_s: float = SKIPPED_S, labels: frozenset[str] = frozenset()):
         """Reads every data frame and looks which files exist; frames are read by `read`.
 
         Args:
           min_mean_reward: runs below are left out.
           skipped_s: left out at the start of each run.
+          labels: which of schema.LABELS the frames should have, where they are recorded.
 
         Raises:
           Refused: for a data frame that asks for more than data.
@@ -129,7 +132,7 @@ class CarlaRecording:
             raise schema.DataError(f"{path}: none of its {len(every)} runs has frames and a mean reward of "
                                    f"{min_mean_reward} or more. Record better ones.")
         self._is_carved = all((run.folder / OCCUPANCY_FOLDER).is_dir() for run in kept)
-        self._kinds = dict(_FILES)
+        self._kinds = _FILES | {key: kind for key, kind in _LABEL_FILES.items() if key in labels}
         if self._is_carved:
             self._kinds["occupancy"] = OCCUPANCY_FOLDER
             kept = [_with_occupancy(run) for run in kept]
@@ -152,6 +155,7 @@ class CarlaRecording:
             lidar=(description.section(header, "lidar", path / SENSORS_FILE, required=False) or LIDAR),
             voxels=(description.section(header, "voxels", path / SENSORS_FILE, required=False) or VOXELS)
             if "occupancy" in modalities else None,
+            classes=carla_files.CLASSES if labels & {"image_classes", "point_classes"} else (),
             contract=description.section(header, "action", path / SENSORS_FILE, required=False)
             or dataclasses.replace(CONTRACT, rate_hz=rate_hz))
 
@@ -182,13 +186,16 @@ class CarlaRecording:
             frame["intrinsics"] = np.asarray(camera.intrinsics, np.float32)
             frame["camera_to_ego"] = np.asarray(camera.camera_to_ego, np.float32)
         if described.lidar is not None and "points_m" in paths:
-            frame["points_m"] = carla_files.read_points(paths["points_m"], described.lidar.position_m).points_m
+            scan = carla_files.read_points(paths["points_m"], described.lidar.position_m)
+            frame["points_m"] = scan.points_m
+            if "point_classes" in paths:
+                frame["point_classes"] = carla_files.point_classes(scan, paths["points_m"])
         if described.voxels is not None and "occupancy" in paths:
             frame["occupancy"] = (_read_occupancy if self._is_carved else carla_files.read_voxels)(
                 paths["occupancy"], described.voxels)
         if "route_map" in paths:
             frame["route_map"] = _nearest(carla_files.read_route_map(paths["route_map"]), _ROUTE_PX)
-        return frame
+        return frame | carla_files.read_labels(paths, described.voxels or VOXELS)
 
 
 def actions(run: Run) -> np.ndarray:

@@ -14,9 +14,11 @@ Facts from the authors' repository (github.com/fzi-forschungszentrum-informatik/
 from __future__ import annotations
 
 import pathlib
+from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
+import scipy.ndimage
 
 from muvo_jax import config as config_lib
 from muvo_jax.data import files, safe_pickle, schema
@@ -31,6 +33,12 @@ BIRDVIEW_BITS = ("background", "road", "lane_marking", "vehicle", "pedestrian", 
 EGO_BOX_M = (2.451, 1.064, 1.511)
 UNLABELLED, PEDESTRIAN, ROAD_LINE, VEHICLE, SKY = 0, 4, 6, 10, 13  # CARLA up to 0.9.13
 UNKNOWN_TAG = 255
+# What the layout's tags mean, in their order.
+CLASSES = ("none", "building", "fence", "other", "pedestrian", "pole", "road line", "road", "sidewalk", "vegetation",
+           "vehicle", "wall", "traffic sign", "sky", "ground", "bridge", "rail", "guard rail", "traffic light",
+           "static", "dynamic", "water", "terrain")
+BIRDVIEW_CELL_M = 0.2
+BIRDVIEW_BEHIND_PX = 32  # rows below the ego, which looks up and stands in the middle column
 # What CARLA's tags from 0.9.14 on (the index) are in the layout's tags, those of 0.9.13; the rest is unlabelled.
 LAYOUT_TAGS = np.zeros(256, np.uint8)
 LAYOUT_TAGS[:29] = (0, 7, 8, 1, 11, 2, 5, 18, 12, 9, 22, 13, 4, 4, 10, 10, 10, 10, 10, 10, 19, 20, 3, 21, 6, 14, 15, 16,
@@ -85,6 +93,48 @@ def read_birdview(path: pathlib.Path) -> np.ndarray:
     """
     pixels = _read(path, (None, None))
     return pixels.astype(np.uint16)  # Pillow says int32 or uint16, depending on its version
+
+
+def read_labels(paths: Mapping[str, pathlib.Path], grid: config_lib.VoxelGrid) -> schema.RawFrame:
+    """The labels whose files are given: depth_m, image_classes, birds_eye_classes and birds_eye_instances.
+
+    The bird's-eye picture is looked up at the middle of each cell of the grid's ground plan: class 255 outside of it.
+
+    Raises:
+      DataError: where a file is missing or damaged.
+    """
+    frame: schema.RawFrame = {}
+    if {"depth_m", "image_classes"} & paths.keys():
+        share, tags = read_depth_semantic(next(paths[key] for key in ("depth_m", "image_classes") if key in paths))
+        frame["depth_m"] = np.where(share < 1.0, share * DEPTH_RANGE_M, np.inf).astype(np.float32)
+        frame["image_classes"] = known_classes(tags)
+    if "birds_eye_classes" in paths:
+        bits = read_birdview(paths["birds_eye_classes"]).astype(np.uint32)
+        # The highest bit that is set; 0 where none is.
+        highest = np.frexp(np.maximum(bits, 1).astype(np.float64))[1].astype(np.uint8) - np.uint8(1)
+        instances, _ = scipy.ndimage.label((bits >> 3 & 3) > 0)
+        ahead_m, left_m = ((np.arange(grid.shape[axis]) + 0.5) * grid.voxel_size_m + grid.origin_m[axis]
+                           for axis in range(2))
+        row = np.floor(bits.shape[0] - BIRDVIEW_BEHIND_PX - ahead_m / BIRDVIEW_CELL_M).astype(np.intp)
+        column = np.floor(bits.shape[1] / 2 - left_m / BIRDVIEW_CELL_M).astype(np.intp)
+        inside = ((row >= 0) & (row < bits.shape[0]))[:, None] & ((column >= 0) & (column < bits.shape[1]))[None]
+        place = (np.clip(row, 0, bits.shape[0] - 1)[:, None], np.clip(column, 0, bits.shape[1] - 1)[None])
+        frame["birds_eye_classes"] = np.where(inside, highest[place], np.uint8(UNKNOWN_TAG))
+        frame["birds_eye_instances"] = np.where(inside, instances[place], 0).astype(np.int32)
+    return frame
+
+
+def known_classes(tags: np.ndarray) -> np.ndarray:
+    """Tags as indices into CLASSES, uint8; 255 for those that the layout does not know (CARLA 0.9.14)."""
+    return np.where(tags < len(CLASSES), tags, UNKNOWN_TAG).astype(np.uint8)
+
+
+def point_classes(scan: Points, path: pathlib.Path) -> np.ndarray:
+    """uint8 [N], what each point hit; raises DataError where the recording does not say."""
+    if scan.tags is None:
+        raise schema.DataError(f"{path}: its points have no tags (ObjTag), which the head semantic_range_view learns "
+                               f"from. Leave the head out, or record a semantic lidar.")
+    return known_classes(scan.tags)
 
 
 def read_route_map(path: pathlib.Path) -> np.ndarray:

@@ -63,6 +63,15 @@ def read_npz(path: pathlib.Path, name: str) -> np.ndarray:
                                f"again, or delete it so that the sequence is split there.") from error
 
 
+def npz_holds(path: pathlib.Path, name: str) -> bool:
+    """Whether a readable NPZ file has an array of that name."""
+    try:
+        with zipfile.ZipFile(path) as archive:
+            return f"{name}.npy" in archive.namelist()
+    except _ARCHIVE_ERRORS:
+        return False
+
+
 def read_toml(path: pathlib.Path) -> dict:
     """Returns a parsed TOML file; raises DataError where it is missing or malformed."""
     try:

@@ -79,13 +79,14 @@ class TrainBatches:
     """
 
     def __init__(self, frames: Frames, *, seed: int, batch: int | None = None, start_state: State | None = None,
-                 process: int = 0, processes: int = 1):
+                 process: int = 0, processes: int = 1, accumulate: int = 1):
         """Opens the stream.
 
         Args:
           batch: windows per batch over all processes, by default config.train.batch.
           process, processes: which share of each batch is read here, such as jax.process_index() of
             jax.process_count(). The order of the windows, and so the saved position, is the same for any number.
+          accumulate: micro-batches in a batch; of each of them every process reads its share.
           start_state: from `get_state` of a stream with the same recording, seed and sizes.
 
         Raises:
@@ -95,15 +96,16 @@ class TrainBatches:
         windows = windows_lib.find_windows(frames.recording, "train", frames=data.frames, stride=data.stride)
         size = batch or frames.config.train.batch
         self.windows_per_epoch = len(windows)
-        if size % processes or not 0 <= process < processes:
-            raise schema.DataError(f"process {process} of {processes}: a batch of {size} windows needs a number of "
-                                   f"processes that divides it, and a process from 0 to that number - 1.")
-        share = slice(process * size // processes, (process + 1) * size // processes)
+        if size % (processes * accumulate) or not 0 <= process < processes:
+            raise schema.DataError(f"process {process} of {processes}: a batch of {size} windows in {accumulate} "
+                                   f"micro-batches needs a number of processes that divides each of them, and a "
+                                   f"process from 0 to that number - 1.")
+        share = np.arange(size).reshape(accumulate, processes, -1)[:, process].ravel()
         self._identity = {"seed": seed, "windows": len(windows), "batch": size, "frames": data.frames,
                           "stride": data.stride}
         # There is no remainder to drop; without the flag Grain's length of batches of one overflows.
         dataset = grain.MapDataset.source(windows).seed(seed).shuffle().repeat().batch(
-            size, drop_remainder=True, batch_fn=lambda chosen: frames.batch(chosen[share]))
+            size, drop_remainder=True, batch_fn=lambda chosen: frames.batch([chosen[index] for index in share]))
         options = grain.ReadOptions(num_threads=_READ_THREADS, prefetch_buffer_size=_READ_AHEAD)
         self._iterator = iter(dataset.to_iter_dataset(options))
         if start_state is not None:

@@ -7,7 +7,14 @@
     ROOT/<split>/<run>/occupancy/000012.npz     occupancy uint8 [X, Y, Z]
     ROOT/<split>/<run>/route_map/000012.png     8 bit
 
-recorder.py writes it. Depth and class images may lie beside these; nothing here reads them.
+and, read only where a head learns from them,
+
+    ROOT/<split>/<run>/depth/000012.png         16 bit, centimetres along the optical axis, 65535 where nothing is hit
+    ROOT/<split>/<run>/classes/000012.png       8 bit, index into `classes` of recording.toml (left out: the town's)
+    ROOT/<split>/<run>/lidar/000012.npz         also point_tags uint8 [N], the class of each point
+    ROOT/<split>/<run>/birds_eye/000012.npz     birds_eye_classes uint8 and birds_eye_instances int32 [X, Y]
+
+recorder.py writes it.
 """
 
 from __future__ import annotations
@@ -20,6 +27,7 @@ import warnings
 import numpy as np
 
 from muvo_jax.data import description, files, schema
+from muvo_jax.data.town import boxes
 
 SCHEMA_VERSION = 1
 DESCRIPTION_FILE = "recording.toml"
@@ -27,6 +35,10 @@ FRAMES_FILE = "frames.csv"
 # RawFrame key -> (folder, suffixes) of the modalities that are files.
 _FILES = {"image": ("image", (".png", ".jpg", ".jpeg")), "points_m": ("lidar", (".npz",)),
           "occupancy": ("occupancy", (".npz",)), "route_map": ("route_map", (".png",))}
+_LABEL_FILES = {"depth_m": ("depth", (".png",)), "image_classes": ("classes", (".png",)),
+                "birds_eye_classes": ("birds_eye", (".npz",)), "birds_eye_instances": ("birds_eye", (".npz",))}
+DEPTH_UNIT_M = 0.01
+DEPTH_SKY = 65535
 _COLUMNS = ("frame_id", "timestamp_s", "speed_mps", "acceleration", "steering")
 _OPTIONAL_COLUMNS = ("reward", "is_terminal", "x_m", "y_m", "yaw_rad")
 _POSE = ("x_m", "y_m", "yaw_rad")
@@ -44,8 +56,11 @@ class Run:
 class PlainRecording:
     """A folder in the plain format."""
 
-    def __init__(self, path: pathlib.Path | str):
+    def __init__(self, path: pathlib.Path | str, *, labels: frozenset[str] = frozenset()):
         """Reads the description and every frames.csv, and looks which files exist; frames are read by `read`.
+
+        Args:
+          labels: which of schema.LABELS the frames should have, where they are recorded.
 
         Raises:
           DataError: for a description of another version or with wrong fields, no complete run, or a malformed
@@ -57,17 +72,21 @@ class PlainRecording:
         splits = tuple(description.field(header, "splits", list, toml_path))
         runs = read_runs(root, splits)
         rate_hz = description.rate_hz(header, toml_path)
-        modalities = _modalities(runs)
+        self._files = _FILES | {key: place for key, place in _LABEL_FILES.items() if key in labels}
+        modalities = _modalities(runs, self._files)
+        if "point_classes" in labels and _has_point_tags(runs):
+            modalities |= {"point_classes"}
         self._runs = {f"{run.split}/{run.folder.name}": run for run in runs}
         self.sequences = tuple(sequence for name, run in self._runs.items()
-                               for sequence in _cut(run, name, modalities, 1.0 / rate_hz))
+                               for sequence in _cut(run, name, modalities, self._files, 1.0 / rate_hz))
         lidar = description.section(header, "lidar", toml_path, required="points_m" in modalities)
         voxels = description.section(header, "voxels", toml_path, required="occupancy" in modalities)
         contract = description.section(header, "action", toml_path, required=True)
         camera = description.section(header, "camera", toml_path, required="image" in modalities)
         self.description = schema.RecordingDescription(
             name=str(description.field(header, "name", str, toml_path)), kind="plain", rate_hz=rate_hz, camera=camera,
-            lidar=lidar, voxels=voxels, contract=contract, modalities=modalities, splits=splits)
+            lidar=lidar, voxels=voxels, contract=contract, modalities=modalities, splits=splits,
+            classes=_class_names(header, toml_path) if labels & {"image_classes", "point_classes"} else ())
 
     def read(self, sequence: schema.Sequence, index: int) -> schema.RawFrame:
         """See schema.Recording."""
@@ -89,8 +108,8 @@ class PlainRecording:
             frame["reward"] = np.float32(columns["reward"][position])
         if "is_terminal" in described.modalities:
             frame["is_terminal"] = np.bool_(columns["is_terminal"][position])
-        paths = {key: _path(run.folder / folder, frame_id, suffixes) for key, (folder, suffixes) in _FILES.items()
-                 if key in described.modalities}
+        paths = {key: _path(run.folder / folder, frame_id, suffixes)
+                 for key, (folder, suffixes) in self._files.items() if key in described.modalities}
         if described.camera is not None and "image" in paths:
             camera = described.camera
             frame["image"] = files.read_image(paths["image"], "RGB")
@@ -107,7 +126,47 @@ class PlainRecording:
         if "route_map" in paths:
             frame["route_map"] = files.read_image(paths["route_map"], "L")
             _check_shape(frame["route_map"], (64, 64), paths["route_map"])
+        self._read_labels(frame, paths)
         return frame
+
+    def _read_labels(self, frame: schema.RawFrame, paths: dict[str, pathlib.Path]) -> None:
+        """Adds what was asked for of schema.LABELS."""
+        described = self.description
+        if described.camera is not None:
+            size = (described.camera.height_px, described.camera.width_px)
+            if "depth_m" in paths:
+                frame["depth_m"] = decode_depth(files.read_image(paths["depth_m"], None))
+                _check_shape(frame["depth_m"], size, paths["depth_m"])
+            if "image_classes" in paths:
+                frame["image_classes"] = files.read_image(paths["image_classes"], "L")
+                _check_shape(frame["image_classes"], size, paths["image_classes"])
+        if "point_classes" in described.modalities:
+            frame["point_classes"] = files.read_npz(paths["points_m"], "point_tags").astype(np.uint8, copy=False)
+            _check_shape(frame["point_classes"], frame["points_m"].shape[:1], paths["points_m"])
+        if "birds_eye_classes" in paths and described.voxels is not None:
+            place, ground = paths["birds_eye_classes"], described.voxels.shape[:2]
+            frame["birds_eye_classes"] = files.read_npz(place, "birds_eye_classes").astype(np.uint8, copy=False)
+            frame["birds_eye_instances"] = files.read_npz(place, "birds_eye_instances").astype(np.int32, copy=False)
+            _check_shape(frame["birds_eye_classes"], ground, place)
+            _check_shape(frame["birds_eye_instances"], ground, place)
+
+
+def decode_depth(pixels: np.ndarray) -> np.ndarray:
+    """Centimetres (16 bit) to float32 metres, infinite in the sky."""
+    return np.where(pixels == DEPTH_SKY, np.float32(np.inf), pixels.astype(np.float32) * np.float32(DEPTH_UNIT_M))
+
+
+def _class_names(header: dict, path: pathlib.Path) -> tuple[str, ...]:
+    """The names of the classes, those of the town where the recording does not say."""
+    if "classes" not in header:
+        return boxes.CLASSES
+    return tuple(map(str, description.field(header, "classes", list, path)))
+
+
+def _has_point_tags(runs: list[Run]) -> bool:
+    """Whether the scans say what each point hit, judged by the first of each run."""
+    first = [next(iter(sorted((run.folder / _FILES["points_m"][0]).glob("*.npz"))), None) for run in runs]
+    return all(place is not None and files.npz_holds(place, "point_tags") for place in first)
 
 
 def _path(folder: pathlib.Path, frame_id: int, suffixes: tuple[str, ...]) -> pathlib.Path:
@@ -195,10 +254,10 @@ def _number(path: pathlib.Path, line: int, name: str, text: str | None) -> float
     return value
 
 
-def _modalities(runs: list[Run]) -> frozenset[str]:
+def _modalities(runs: list[Run], kinds: dict[str, tuple[str, tuple[str, ...]]]) -> frozenset[str]:
     """The keys of RawFrame that at least one run has; where another run lacks one, its frames are left out."""
     names = {"speed_mps", "action", "timestamp_s", "frame_id"}
-    names |= {key for key, (folder, _) in _FILES.items() if any((run.folder / folder).is_dir() for run in runs)}
+    names |= {key for key, (folder, _) in kinds.items() if any((run.folder / folder).is_dir() for run in runs)}
     names |= {name for name in ("reward", "is_terminal", "yaw_rate_radps")
               if all(name in run.columns for run in runs)}
     if all(run.columns.keys() >= set(_POSE) for run in runs):
@@ -208,12 +267,13 @@ def _modalities(runs: list[Run]) -> frozenset[str]:
     return frozenset(names)
 
 
-def _cut(run: Run, name: str, modalities: frozenset[str], period_s: float) -> list[schema.Sequence]:
+def _cut(run: Run, name: str, modalities: frozenset[str], kinds: dict[str, tuple[str, tuple[str, ...]]],
+         period_s: float) -> list[schema.Sequence]:
     """The gap-free sequences of a run (a terminal frame ends one); warns of gaps."""
     frame_ids = run.columns["frame_id"].astype(np.int64).tolist()
     absent = {}
     present = np.ones(len(frame_ids), bool)
-    for key, (folder, suffixes) in _FILES.items():
+    for key, (folder, suffixes) in kinds.items():
         if key in modalities:
             have = set().union(*(files.numbered(run.folder / folder, suffix) for suffix in suffixes))
             there = np.array([frame_id in have for frame_id in frame_ids], bool)

@@ -26,8 +26,11 @@ _SHORT = {"stride": 1, "context": 4, "horizon": 4, "frames": 8}
 _SIDE_MULTIPLE = 32
 # Targets that every recording has, or that are made of what it has; the others it must hold itself.
 _ALWAYS_THERE = frozenset({"image", "range_view", "occupancy", "action"})
-# Targets that are made of other fields of a frame.
-_MADE_OF = {"ego_motion": frozenset({"pose", "speed_mps"})}
+# Targets that are made of other fields of a frame, or brought to the model's size.
+_MADE_OF = {"ego_motion": frozenset({"pose", "speed_mps"}), "range_view_classes": frozenset({"point_classes"}),
+            "depth_m": frozenset({"depth_m"}), "image_classes": frozenset({"image_classes"})}
+DEPTH_LIMIT_M = 100.0  # what is farther counts as nothing
+UNLABELLED = 255
 NAVIGATION = ("command", "next_command", "target_m", "next_target_m")
 
 PreparedFrame = dict[str, np.ndarray | np.generic]  # names and dtypes of types.Batch without B and T
@@ -54,7 +57,7 @@ def adapt(config: config_lib.Config, recording: schema.Recording, *, keep: Colle
       keep: dotted names, such as "data.stride", that the user chose; they are left alone.
 
     Raises:
-      DataError: where the recording lacks what every model needs (camera, lidar, actions), its voxel grid
+      DataError: where the recording lacks what every model needs (actions, and camera or lidar), its voxel grid
         does not suit the voxel decoder, or its sequences are shorter than a window.
     """
     description = recording.description
@@ -76,8 +79,12 @@ def prepare_frame(raw: schema.RawFrame, config: config_lib.Config) -> PreparedFr
     model = config.model
     ready: PreparedFrame = {name: raw[name] for name in ("action", "timestamp_s", "frame_id")}
     try:
-        ready["image"], ready["intrinsics"] = camera_ops.resize_crop(raw["image"], raw["intrinsics"], model.image_size)
-        ready["range_view"] = range_view_ops.project(raw["points_m"], model.range_view)
+        if model.camera != config_lib.NO_SENSOR or "image" in model.targets:
+            ready["image"], ready["intrinsics"] = camera_ops.resize_crop(raw["image"], raw["intrinsics"],
+                                                                         model.image_size)
+            ready["camera_to_ego"] = raw["camera_to_ego"]
+        if model.lidar != config_lib.NO_SENSOR or "range_view" in model.targets:
+            ready["range_view"] = range_view_ops.project(raw["points_m"], model.range_view)
         if "occupancy" in model.heads:
             ready["occupancy"] = _occupancy(raw, model)
     except ValueError as error:
@@ -85,27 +92,49 @@ def prepare_frame(raw: schema.RawFrame, config: config_lib.Config) -> PreparedFr
     if model.lidar == "pp":
         ready["points"], ready["point_count"] = padded_points(raw["points_m"], model.pillars.points,
                                                                int(raw["frame_id"]))
-    ready["camera_to_ego"] = raw["camera_to_ego"]
     if model.navigation:
         ready |= {name: raw[name] for name in NAVIGATION}  # type: ignore[literal-required]
     if model.route:
         ready["route_map"] = raw["route_map"]
     if model.speed:
         ready["speed_mps"] = raw["speed_mps"]
-    for name in ("reward", "is_terminal", *(model.targets.keys() - _ALWAYS_THERE)):
+    for name in ("reward", "is_terminal", *(model.targets.keys() - _ALWAYS_THERE - _MADE_OF.keys())):
         if name in raw:
             ready[name] = raw[name]  # type: ignore[literal-required]
     if "ego_motion" in model.targets:  # still in the frame of the run: motion begins with a second frame
         ready["ego_motion"] = np.array([*raw["pose"], raw["speed_mps"]])
+    return ready | _labels(raw, model)
+
+
+def _labels(raw: schema.RawFrame, model: config_lib.ModelConfig) -> PreparedFrame:
+    """The targets of optional heads that must be brought to the model's sizes, as far as the frame has them."""
+    ready: PreparedFrame = {}
+    if "depth_m" in raw and "depth_m" in model.targets:
+        depth_m = camera_ops.resize_crop_nearest(raw["depth_m"], model.image_size)
+        ready["depth_m"] = np.where(depth_m < DEPTH_LIMIT_M, depth_m, range_view_ops.NO_RETURN_M).astype(np.float32)
+    if "image_classes" in raw and "image_classes" in model.targets:
+        ready["image_classes"] = camera_ops.resize_crop_nearest(raw["image_classes"], model.image_size)
+    if "point_classes" in raw and "range_view_classes" in model.targets:
+        winner = range_view_ops.nearest_points(raw["points_m"], model.range_view)
+        classes = np.append(raw["point_classes"], np.uint8(UNLABELLED))  # where no point is, its number is -1
+        ready["range_view_classes"] = classes[winner]
     return ready
+
+
+def labels(model: config_lib.ModelConfig) -> frozenset[str]:
+    """Which of schema.LABELS the heads of a model learn from."""
+    return schema.LABELS & _recorded(model.targets)
+
+
+def _recorded(targets: Collection[str]) -> frozenset[str]:
+    """The keys of RawFrame that these targets are made of, without those that every recording has."""
+    return frozenset().union(*(_MADE_OF.get(field, {field}) for field in targets)) - _ALWAYS_THERE
 
 
 def check_targets(model: config_lib.ModelConfig, description: schema.RecordingDescription) -> None:
     """Raises DataError where a head cannot be trained: names the head, what the recording lacks, and the way out."""
     for head in model.heads:
-        fields = config_lib.TARGETS[head](model).keys() - _ALWAYS_THERE
-        needed = frozenset().union(*(_MADE_OF.get(field, {field}) for field in fields))
-        for field in sorted(needed - description.modalities):
+        for field in sorted(_recorded(config_lib.TARGETS[head](model).keys()) - description.modalities):
             others = ",".join(name for name in model.heads if name != head)
             raise schema.DataError(f"head {head!r} learns from {field}, which recording {description.name!r} does not "
                                    f"hold. Leave the head out (--heads={others}), or record {field}.")
@@ -137,14 +166,16 @@ def _occupancy(raw: schema.RawFrame, model: config_lib.ModelConfig) -> np.ndarra
 
 def _fit_model(model: config_lib.ModelConfig, description: schema.RecordingDescription,
                notes: list[str]) -> config_lib.ModelConfig:
-    camera, lidar = description.camera, description.lidar
-    lacking = sorted({"image", "points_m", "action"} - description.modalities)
-    if camera is None or lidar is None or lacking:
-        raise schema.DataError(f"recording {description.name!r} lacks {', '.join(lacking) or 'a sensor description'}; "
-                               f"every model needs camera, lidar and actions. Record these too.")
-    heads = model.heads
-    changes: dict = {"image_size": _image_size(camera, model.image_size[1])}
-    changes["range_view"] = dataclasses.replace(lidar, rows=model.range_view.rows, columns=model.range_view.columns)
+    model = _without_what_lacks(model, description, notes)
+    camera, lidar, heads = description.camera, description.lidar, model.heads
+    changes: dict = {}
+    if camera is not None and "image" in description.modalities:
+        changes["image_size"] = _image_size(camera, model.image_size[1])
+        if changes["image_size"] != model.image_size:
+            notes.append(f"images of {camera.width_px}x{camera.height_px} pixels become {changes['image_size'][1]}x"
+                         f"{changes['image_size'][0]}: scaled by width, rows cut off at the top.")
+    if lidar is not None:
+        changes["range_view"] = dataclasses.replace(lidar, rows=model.range_view.rows, columns=model.range_view.columns)
     if description.voxels is not None and "occupancy" in heads:
         changes["voxels"] = description.voxels
         changes["occupancy_blocks"] = _occupancy_blocks(model.occupancy_blocks, description.voxels)
@@ -154,6 +185,8 @@ def _fit_model(model: config_lib.ModelConfig, description: schema.RecordingDescr
     elif "occupancy" in heads:
         notes.append("no occupancy is recorded: the target is what each lidar scan hit and looked through, unknown "
                      "elsewhere.")
+    if description.classes:
+        changes["semantic_classes"] = len(description.classes)
     if model.route and "route_map" not in description.modalities:
         changes["route"] = False
         notes.append("no route map is recorded: the model has no route input.")
@@ -163,10 +196,40 @@ def _fit_model(model: config_lib.ModelConfig, description: schema.RecordingDescr
     if model.navigation and not description.modalities.issuperset(NAVIGATION):
         changes["navigation"] = False
         notes.append("no navigation commands are recorded: the model has no such input.")
-    if changes["image_size"] != model.image_size:
-        notes.append(f"images of {camera.width_px}x{camera.height_px} pixels become {changes['image_size'][1]}x"
-                     f"{changes['image_size'][0]}: scaled by width, rows cut off at the top.")
     return dataclasses.replace(model, **changes)
+
+
+def _without_what_lacks(model: config_lib.ModelConfig, description: schema.RecordingDescription,
+                        notes: list[str]) -> config_lib.ModelConfig:
+    """The model without input and heads of a sensor that the recording lacks.
+
+    Raises:
+      DataError: where that leaves nothing to see or to predict.
+    """
+    missing = set()
+    for sensor, field, described in (("camera", "image", description.camera), ("lidar", "points_m", description.lidar)):
+        if described is None or field not in description.modalities:
+            missing.add(sensor)
+    if len(missing) == 2 or "action" not in description.modalities:
+        raise schema.DataError(f"recording {description.name!r} holds {', '.join(sorted(description.modalities))}; "
+                               f"every model needs actions and, with their sensor's description, images or lidar "
+                               f"scans. Record these too.")
+    heads = {"image"} & set(model.heads) if "camera" in missing else set()
+    if "lidar" in missing:
+        without = {"range_view"} if "occupancy" in description.modalities else {"range_view", "occupancy"}
+        heads |= without & set(model.heads)
+    for sensor in sorted(missing):
+        which = f" and no head {', '.join(sorted(heads))}" if heads else ""
+        notes.append(f"no {'images are' if sensor == 'camera' else 'lidar scans are'} recorded: the model has no "
+                     f"{sensor} input{which}.")
+    kept = tuple(head for head in model.heads if head not in heads)
+    seen = {sensor for sensor in ("camera", "lidar") if getattr(model, sensor) != config_lib.NO_SENSOR} - missing
+    if not seen or not kept:
+        raise schema.DataError(f"recording {description.name!r} lacks {', '.join(sorted(missing))}: nothing is left to "
+                               f"{'see' if not seen else 'predict'} for a model with camera {model.camera}, lidar "
+                               f"{model.lidar} and heads {', '.join(model.heads)}. Choose other ones.")
+    changes: dict = dict.fromkeys(missing, config_lib.NO_SENSOR)
+    return dataclasses.replace(model, heads=kept, **changes)
 
 
 def _image_size(camera: schema.Camera, columns: int) -> tuple[int, int]:

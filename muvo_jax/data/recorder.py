@@ -25,8 +25,7 @@ from muvo_jax.data import plain, schema
 
 COLUMNS = ("frame_id", "timestamp_s", "x_m", "y_m", "yaw_rad", "speed_mps", "acceleration", "steering", "reward",
            "is_terminal", "weather")
-DEPTH_UNIT_M = 0.01
-DEPTH_SKY = 65535
+DEPTH_UNIT_M, DEPTH_SKY = plain.DEPTH_UNIT_M, plain.DEPTH_SKY
 _IMAGES = ("image", "classes", "route_map")
 _ARRAYS = {"points_m": "lidar", "occupancy": "occupancy"}
 
@@ -82,7 +81,8 @@ class RunWriter:
         Args:
           frame: frame_id (int) and timestamp_s; the other names of COLUMNS as far as they are known; and any of
             image uint8 [H, W, 3], depth_m float [H, W] (infinite in the sky), classes and route_map uint8 [H, W],
-            points_m float [N, 3] (with point_tags uint8 [N], what each hit), occupancy uint8 [X, Y, Z].
+            points_m float [N, 3] (with point_tags uint8 [N], what each hit), occupancy uint8 [X, Y, Z],
+            birds_eye_classes uint8 [X, Y] with birds_eye_instances int32 [X, Y].
 
         Raises:
           ValueError: where frame_id does not increase.
@@ -101,6 +101,10 @@ class RunWriter:
                 if name == "points_m" and "point_tags" in frame:
                     arrays["point_tags"] = np.asarray(frame["point_tags"], np.uint8)
                 self._path(folder, frame_id, ".npz").write_bytes(npz_bytes(arrays))
+        if "birds_eye_classes" in frame:
+            arrays = {"birds_eye_classes": np.asarray(frame["birds_eye_classes"], np.uint8),
+                      "birds_eye_instances": np.asarray(frame["birds_eye_instances"], np.int32)}
+            self._path("birds_eye", frame_id, ".npz").write_bytes(npz_bytes(arrays))
         self._rows.append([_cell(frame.get(name, "")) for name in COLUMNS])
 
     def close(self) -> None:
@@ -127,7 +131,7 @@ def encode_depth(depth_m: np.ndarray) -> np.ndarray:
 
 def decode_depth(pixels: np.ndarray) -> np.ndarray:
     """The inverse of `encode_depth`: float32 metres, infinite in the sky."""
-    return np.where(pixels == DEPTH_SKY, np.float32(np.inf), pixels.astype(np.float32) * np.float32(DEPTH_UNIT_M))
+    return plain.decode_depth(pixels)
 
 
 def write_atomically(path: pathlib.Path, content: str | bytes) -> None:

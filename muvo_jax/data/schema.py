@@ -13,6 +13,9 @@ import numpy as np
 
 from muvo_jax import config as config_lib
 
+# Keys of RawFrame that a reader fills only where `labels` names them: they cost time, and few models learn from them.
+LABELS = frozenset({"depth_m", "image_classes", "point_classes", "birds_eye_classes", "birds_eye_instances"})
+
 
 class DataError(ValueError):
     """Recorded data that cannot be used; the message names the file, what was expected and how to go on."""
@@ -32,6 +35,9 @@ class RawFrame(TypedDict, total=False):
       points_m: float32 [N, 3], ego frame.
       occupancy: uint8 [X, Y, Z], 0 empty, 1 occupied, 255 unknown, in the grid `RecordingDescription.voxels`.
       route_map: uint8 [64, 64].
+      depth_m: float32 [H, W], along the optical axis, infinite in the sky; image_classes: uint8 [H, W], index into
+        RecordingDescription.classes; point_classes: uint8 [N], of points_m; birds_eye_classes: uint8 [X, Y] and
+        birds_eye_instances: int32 [X, Y], on the ground plan of the voxels (muvo_jax.types.Batch). Only if asked for.
       action: float32 [2], applied from this frame to the next.
       speed_mps, reward, is_terminal, timestamp_s: scalars.
       command, next_command: int32 scalars, 0 to 5; target_m, next_target_m: float32 [2] (muvo_jax.types.Batch).
@@ -46,6 +52,11 @@ class RawFrame(TypedDict, total=False):
     points_m: np.ndarray
     occupancy: np.ndarray
     route_map: np.ndarray
+    depth_m: np.ndarray
+    image_classes: np.ndarray
+    point_classes: np.ndarray
+    birds_eye_classes: np.ndarray
+    birds_eye_instances: np.ndarray
     speed_mps: np.float32
     pose: np.ndarray
     yaw_rate_radps: np.float32
@@ -107,6 +118,7 @@ class RecordingDescription:
       modalities: the keys of RawFrame that every frame has.
       splits: in the order in which they should be reported.
       notes: sentences that whoever starts a run should read.
+      classes: names of image_classes and point_classes, in order; empty where the recording has neither.
     """
 
     name: str
@@ -119,6 +131,7 @@ class RecordingDescription:
     modalities: frozenset[str]
     splits: tuple[str, ...]
     notes: tuple[str, ...] = ()
+    classes: tuple[str, ...] = ()
 
 
 class Recording(Protocol):

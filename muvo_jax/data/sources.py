@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import pathlib
-from collections.abc import Callable
-from typing import NamedTuple
+from collections.abc import Callable, Collection
+from typing import Any, NamedTuple
 
 from muvo_jax import config as config_lib
-from muvo_jax.data import carla, files, kitti, plain, records, schema
+from muvo_jax.data import carla, files, kitti, plain, prepare, records, schema
 from muvo_jax.data.town import record
 
 
@@ -41,13 +41,14 @@ KINDS = (
 )
 
 
-def open_recording(path: pathlib.Path | str, *, camera: str = "",
-                   skip_corrupt_shards: bool = False) -> schema.Recording:
+def open_recording(path: pathlib.Path | str, *, camera: str = "", skip_corrupt_shards: bool = False,
+                   labels: Collection[str] = ()) -> schema.Recording:
     """Opens a folder with the reader of its kind (the built-in town is a plain recording in its cache folder).
 
     Args:
       camera: which one, where the format records several; by default the reader's choice.
       skip_corrupt_shards: of a packed recording; see records.PackedRecording.
+      labels: which of schema.LABELS the frames should have, where the recording holds them.
 
     Raises:
       DataError: for a path that is missing, a file, empty or of no known kind (naming the kinds and what was found), or
@@ -70,7 +71,10 @@ def open_recording(path: pathlib.Path | str, *, camera: str = "",
                                        f"{' but ' + ', '.join(kind.cameras) if kind.cameras else '; it has one only'}.")
             if kind.open is records.PackedRecording and skip_corrupt_shards:
                 return records.PackedRecording(path, corrupt="skip")
-            return kind.open(path, camera=camera) if camera else kind.open(path)
+            options: dict[str, Any] = {"camera": camera} if camera else {}
+            if kind.open in (plain.PlainRecording, carla.CarlaRecording):
+                options["labels"] = frozenset(labels)
+            return kind.open(path, **options)
     raise schema.DataError(f"data folder {path} is of no known kind. Known are {known}. Found {files.listing(path)}.")
 
 
@@ -84,6 +88,6 @@ def open_configured(config: config_lib.Config, progress: record.Progress | None 
       DataError: as open_recording.
     """
     if config.data.path == "town":
-        return open_recording(record.cached_town(config, progress))
-    return open_recording(config.data.path, camera=config.data.camera,
+        return open_recording(record.cached_town(config, progress), labels=prepare.labels(config.model))
+    return open_recording(config.data.path, camera=config.data.camera, labels=prepare.labels(config.model),
                           skip_corrupt_shards=config.data.skip_corrupt_shards)

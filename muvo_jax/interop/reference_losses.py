@@ -1,4 +1,4 @@
-"""Terms of the reference for heads that no default trains, and its metrics of occupancy by class, for parity.
+"""Terms of the reference as it takes and reduces them, and its metrics of occupancy by class, for parity.
 
 Class logits are [..., classes] with integer targets [...]; pictures are [N, H, W, C] in [0, 1].
 """
@@ -9,9 +9,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from muvo_jax.objectives import classification, perceptual, similarity
+
 IGNORED = 255
 _LOG_FLOOR = -100.0
-_SSIM_SIZE, _SSIM_SIGMA, _SSIM_C1, _SSIM_C2 = 11, 1.5, 0.01 ** 2, 0.03 ** 2
 
 
 def cross_entropy(logits: jax.Array, target: jax.Array, *, weights: tuple[float, ...] | None = None,
@@ -25,15 +26,9 @@ def cross_entropy(logits: jax.Array, target: jax.Array, *, weights: tuple[float,
       top_share: of each frame only the int(share * P) largest losses count.
       poly: adds poly * (1 - exp(-loss)) to each pixel's unweighted loss.
     """
-    logarithm = jax.nn.log_softmax(logits, axis=-1)
-    loss = -jnp.take_along_axis(logarithm, target.astype(jnp.int32)[..., None], axis=-1)[..., 0]
-    if weights is not None:
-        loss = loss * jnp.asarray(weights, loss.dtype)[target.astype(jnp.int32)]
-    if poly:
-        loss = loss + poly * (1.0 - jnp.exp(-loss))
-    if top_share is not None:
-        loss, _ = jax.lax.top_k(loss, int(top_share * loss.shape[1]))
-    return loss.mean()
+    return classification.cross_entropy_sums(
+        logits[None], target[None], weights=weights or (), top_share=1.0 if top_share is None else top_share,
+        poly=poly).value()
 
 
 def semantic_scal(logits: jax.Array, target: jax.Array) -> jax.Array:
@@ -74,57 +69,19 @@ def _negative_log_ratio(part: jax.Array, whole: jax.Array) -> jax.Array:
 def dice(logits: jax.Array, target: jax.Array, *, epsilon: float, naive: bool) -> jax.Array:
     """1 - Dice coefficient of "not empty", mean over frames of logits [F, P, classes]; naive: sums, not squares."""
     filled, truth = 1.0 - jax.nn.softmax(logits, axis=-1)[..., 0], (target != 0).astype(logits.dtype)
-    both = 2.0 * (filled * truth).sum(axis=1)
-    if naive:
-        return (1.0 - (both + epsilon) / (filled.sum(axis=1) + truth.sum(axis=1) + epsilon)).mean()
-    squares = jnp.square(filled).sum(axis=1) + jnp.square(truth).sum(axis=1) + 2.0 * epsilon
-    return (1.0 - both / squares).mean()
+    return classification.dice_sums(filled, truth, epsilon=epsilon, naive=naive).value()
 
 
-def ssim_window() -> np.ndarray:
-    """float32 [11, 11]: the Gaussian over which structural similarity compares pictures."""
-    offset = np.arange(_SSIM_SIZE) - _SSIM_SIZE // 2
-    line = np.exp(-np.square(offset) / (2 * _SSIM_SIGMA ** 2)).astype(np.float32)
-    line /= line.sum()
-    return np.outer(line, line)
+ssim_window = similarity.window
 
 
 def ssim(prediction: jax.Array, target: jax.Array, *, non_negative: bool = False) -> jax.Array:
-    """Structural similarity of each picture, averaged (Wang et al., 2004): pictures [N, H, W, C] -> scalar."""
-    line = jnp.asarray(ssim_window().sum(axis=0))
-
-    def blur(image: jax.Array) -> jax.Array:
-        for axis in (1, 2):
-            count = image.shape[axis] - _SSIM_SIZE + 1
-            image = sum((line[tap] * jax.lax.slice_in_dim(image, tap, tap + count, axis=axis)
-                         for tap in range(_SSIM_SIZE)), jnp.float32(0.0))
-        return image
-
-    mean_p, mean_t = blur(prediction), blur(target)
-    # Variances do not depend on an offset; about the middle of [0, 1] their differences cancel less.
-    from_p, from_t, about_p, about_t = prediction - 0.5, target - 0.5, mean_p - 0.5, mean_t - 0.5
-    var_p = blur(from_p * from_p) - about_p * about_p
-    var_t = blur(from_t * from_t) - about_t * about_t
-    covariance = blur(from_p * from_t) - about_p * about_t
-    contrast = (2.0 * covariance + _SSIM_C2) / (var_p + var_t + _SSIM_C2)
-    similarity = (2.0 * mean_p * mean_t + _SSIM_C1) / (mean_p ** 2 + mean_t ** 2 + _SSIM_C1) * contrast
-    each = similarity.mean(axis=(1, 2))
+    """Structural similarity of pictures [N, H, W, C] and channels, averaged; non_negative: negative ones count as 0."""
+    each = similarity.frame_similarity(prediction, target)
     return (jax.nn.relu(each) if non_negative else each).mean()
 
 
-def feature_distance(features: list[jax.Array], targets: list[jax.Array], *, norm: str, style: bool) -> jax.Array:
-    """Sum over levels of the mean squared ("l2") or absolute ("l1") difference of maps, and of their Gram matrices."""
-    measure = {"l1": jnp.abs, "l2": jnp.square}[norm]
-    pairs = list(zip(features, targets, strict=True))
-    total = jnp.stack([measure(ours - theirs).mean() for ours, theirs in pairs]).sum()
-    if style:
-        total += jnp.stack([jnp.square(_gram(ours) - _gram(theirs)).mean() for ours, theirs in pairs]).sum()
-    return total
-
-
-def _gram(maps: jax.Array) -> jax.Array:
-    flat = maps.reshape(maps.shape[0], -1, maps.shape[-1])
-    return jnp.einsum("npc,npd->ncd", flat, flat) / (flat.shape[1] * flat.shape[2])
+feature_distance = perceptual.feature_distance
 
 
 def class_counts(prediction: np.ndarray, truth: np.ndarray, classes: int,

@@ -1,4 +1,7 @@
-"""Fusion of the sensors' maps and the measurements into one embedding per frame (paper section III-B, Table I)."""
+"""Fusion of the sensors' maps and the measurements into one embedding per frame (paper section III-B, Table I).
+
+A model without camera or without lidar has None for that map and fuses what is left (the paper has both).
+"""
 
 from __future__ import annotations
 
@@ -44,28 +47,31 @@ class TransformerFusion(linen.Module):
     config: ModelConfig
 
     @linen.compact
-    def __call__(self, image_map: jax.Array, lidar_map: jax.Array, measurements: list[jax.Array], mode: norm.Mode,
-                 keys: jax.Array | None) -> jax.Array:
+    def __call__(self, image_map: jax.Array | None, lidar_map: jax.Array | None, measurements: list[jax.Array],
+                 mode: norm.Mode, keys: jax.Array | None) -> jax.Array:
         config, compute = self.config, common.compute(self.config)
+        maps = {name: cells for name, cells in (("image", image_map), ("lidar", lidar_map)) if cells is not None}
         channels = config.token_channels
         as_tokens = measurements if config.latent == "2d" else []
-        type_embedding = self.param("type_embedding", layers.shape_only, (2 + len(as_tokens), channels))
+        type_embedding = self.param("type_embedding", layers.shape_only, (len(maps) + len(as_tokens), channels))
         tokens = []
-        for index, cells in enumerate((image_map, lidar_map)):
+        for index, cells in enumerate(maps.values()):
             added = jnp.asarray(attention.sine_positions(cells.shape[1:3], channels)) + type_embedding[index][None]
             tokens.append(cells.reshape(cells.shape[0], -1, channels) + added[None].astype(cells.dtype))
-        for index, value in enumerate(as_tokens, start=2):
+        for index, value in enumerate(as_tokens, start=len(maps)):
             tokens.append(jnp.expand_dims(value + type_embedding[index][None].astype(value.dtype), 1))
-        image_count = tokens[0].shape[1]
         mixed = attention.TransformerEncoder(
             config.transformer_layers, config.transformer_heads, config.transformer_hidden_channels, config.dropout,
             compute, name="transformer")(jnp.concatenate(tokens, axis=1), keys)
         if config.latent == "2d":
             return mixed.astype(jnp.float32)
         compress = functools.partial(Compression, config.fused_channels, compute, keep_cells=config.keep_cells)
-        image_vector = compress(name="image_compression")(mixed[:, :image_count].reshape(image_map.shape), mode)
-        lidar_vector = compress(name="lidar_compression")(mixed[:, image_count:].reshape(lidar_map.shape), mode)
-        joined = jnp.concatenate([image_vector, lidar_vector, *measurements], axis=-1)
+        vectors, start = [], 0
+        for name, cells in maps.items():
+            stop = start + cells.shape[1] * cells.shape[2]
+            vectors.append(compress(name=f"{name}_compression")(mixed[:, start:stop].reshape(cells.shape), mode))
+            start = stop
+        joined = jnp.concatenate([*vectors, *measurements], axis=-1)
         return layers.Dense(config.embedding_channels, compute, name="combine")(joined).astype(jnp.float32)
 
 
@@ -73,30 +79,32 @@ class PooledFusion(linen.Module):
     """What FC and AVG have in common: each sensor's map becomes one vector.
 
     The measurements [N, measurement_channels] are spread over the image map [N, h, w, map_channels], which goes through
-    three levels of a ResNet-18 before it is compressed; the lidar map is compressed as it is. Result: [N,
-    embedding_channels].
+    three levels of a ResNet-18 before it is compressed; the lidar map is compressed as it is. Without a camera the
+    lidar map is treated as the image map. Result: [N, embedding_channels].
     """
 
     config: ModelConfig
 
-    def vectors(self, image_map: jax.Array, lidar_map: jax.Array, measurements: list[jax.Array], mode: norm.Mode,
-                features: int) -> tuple[jax.Array, jax.Array]:
-        """The two vectors [N, features]; to be called in a compact method."""
+    def vectors(self, image_map: jax.Array | None, lidar_map: jax.Array | None, measurements: list[jax.Array],
+                mode: norm.Mode, features: int) -> list[jax.Array]:
+        """One vector [N, features] a sensor, camera first; to be called in a compact method."""
         config, compute = self.config, common.compute(self.config)
-        spread = [jnp.broadcast_to(value[:, None, None], (*image_map.shape[:3], value.shape[-1]))
-                  for value in measurements]
-        joined = jnp.concatenate([image_map, *spread], axis=-1)
+        first, *others = (cells for cells in (image_map, lidar_map) if cells is not None)
+        spread = [jnp.broadcast_to(value[:, None, None], (*first.shape[:3], value.shape[-1])) for value in measurements]
+        joined = jnp.concatenate([first, *spread], axis=-1)
         (deep,) = resnet.ResNet18(config.backbone_width, (3,), compute, name="map_backbone")(joined, mode)
-        return (Compression(features, compute, name="image_state")(deep, mode),
-                Compression(features, compute, halvings=2, name="lidar_state")(lidar_map, mode))
+        vectors = [Compression(features, compute, name="image_state")(deep, mode)]
+        for cells in others:
+            vectors.append(Compression(features, compute, halvings=2, name="lidar_state")(cells, mode))
+        return vectors
 
 
 class ConcatenationFusion(PooledFusion):
     """FC: both vectors side by side, then a dense layer."""
 
     @linen.compact
-    def __call__(self, image_map: jax.Array, lidar_map: jax.Array, measurements: list[jax.Array], mode: norm.Mode,
-                 keys: jax.Array | None) -> jax.Array:
+    def __call__(self, image_map: jax.Array | None, lidar_map: jax.Array | None, measurements: list[jax.Array],
+                 mode: norm.Mode, keys: jax.Array | None) -> jax.Array:
         del keys
         both = self.vectors(image_map, lidar_map, measurements, mode, self.config.fused_channels)
         join = layers.Dense(self.config.embedding_channels, common.compute(self.config), name="join")
@@ -107,11 +115,11 @@ class AverageFusion(PooledFusion):
     """AVG: the mean of both vectors (the paper says so; in the reference's code the line is commented out)."""
 
     @linen.compact
-    def __call__(self, image_map: jax.Array, lidar_map: jax.Array, measurements: list[jax.Array], mode: norm.Mode,
-                 keys: jax.Array | None) -> jax.Array:
+    def __call__(self, image_map: jax.Array | None, lidar_map: jax.Array | None, measurements: list[jax.Array],
+                 mode: norm.Mode, keys: jax.Array | None) -> jax.Array:
         del keys
-        image, lidar = self.vectors(image_map, lidar_map, measurements, mode, self.config.embedding_channels)
-        return 0.5 * (image.astype(jnp.float32) + lidar.astype(jnp.float32))
+        vectors = self.vectors(image_map, lidar_map, measurements, mode, self.config.embedding_channels)
+        return jnp.mean(jnp.stack(vectors).astype(jnp.float32), axis=0)
 
 
 REGISTRY: dict[str, type[linen.Module]] = {"tr": TransformerFusion, "fc": ConcatenationFusion, "avg": AverageFusion}

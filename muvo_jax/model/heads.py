@@ -20,7 +20,7 @@ class Head:
 
     Attributes:
       build: makes the decoder module, given the model's configuration and the channels.
-      channels: of each output.
+      channels: of each output, or what the configuration makes of it; see `channels_of`.
       scales: what the decoder returns; 1 is full size.
       tokens: which group of the 2D latent the decoder reads (muvo_jax.model.tokens), None for one vector of all groups
         (tokens.pool); with the 1D latent it reads all features.
@@ -29,11 +29,15 @@ class Head:
     """
 
     build: Callable[[ModelConfig, int], linen.Module]
-    channels: int
+    channels: int | Callable[[ModelConfig], int]
     scales: tuple[int, ...]
     tokens: str | None
     unit: Callable[[ModelConfig], float | tuple[float, ...]] = lambda config: 1.0
     initial_bias: float | None = None
+
+    def channels_of(self, config: ModelConfig) -> int:
+        """Channels of each output of a model."""
+        return self.channels(config) if callable(self.channels) else self.channels
 
 
 def _plane(config: ModelConfig, channels: int, size: tuple[int, int], token_shrink: int) -> linen.Module:
@@ -81,11 +85,18 @@ def _vector(config: ModelConfig, channels: int) -> linen.Module:
     return decoders.VectorDecoder(channels, config.decoder_channels, common.compute(config))
 
 
+def _classes(config: ModelConfig) -> int:
+    return config.semantic_classes
+
+
 TABLE = {
     "image": Head(_image, 3, (1, 2, 4), "image", initial_bias=0.5),
     "range_view": Head(_range_view, 4, (1, 2, 4), "range_view", unit=lambda config: config.range_scale_m,
                        initial_bias=0.0),
     "occupancy": Head(_occupancy, 2, (1, 2, 4), "occupancy", initial_bias=0.0),
+    "depth": Head(_image, 1, (1, 2, 4), "image", unit=lambda config: config.range_scale_m, initial_bias=0.0),
+    "semantic_image": Head(_image, _classes, (1, 2, 4), "image"),
+    "semantic_range_view": Head(_range_view, _classes, (1, 2, 4), "range_view"),
     "birds_eye": Head(_birds_eye, BIRDS_EYE_CLASSES + decoders.INSTANCE_CHANNELS, (1, 2, 4), "occupancy"),
     "action": Head(_action, 2, (1,), "action"),
     "reward": Head(_vector, 1, (1,), None),  # as recorded with the frame

@@ -18,7 +18,7 @@ import jax
 import jax.numpy as jnp
 from flax import linen
 
-from muvo_jax.config import ModelConfig
+from muvo_jax.config import NO_SENSOR, ModelConfig
 from muvo_jax.model import camera, fusion, heads, lidar, measurements, outputs, tokens, transition
 from muvo_jax.nn import init as init_lib
 from muvo_jax.nn import layers, norm
@@ -34,8 +34,10 @@ class Network(linen.Module):
 
     def setup(self):
         config = self.config
-        self.camera = camera.REGISTRY[config.camera](config)
-        self.lidar = lidar.REGISTRY[config.lidar](config)
+        if config.camera != NO_SENSOR:
+            self.camera = camera.REGISTRY[config.camera](config)
+        if config.lidar != NO_SENSOR:
+            self.lidar = lidar.REGISTRY[config.lidar](config)
         if config.route:
             self.route = measurements.RouteEncoder(config)
         if config.navigation:
@@ -46,7 +48,7 @@ class Network(linen.Module):
             self.speed = measurements.SpeedEncoder(config)
         self.fusion = fusion.REGISTRY[config.fusion](config)
         self.transition = transition.REGISTRY[config.latent](config)
-        self.decoders = {name: head.build(config, head.channels) for name, head in heads.TABLE.items()
+        self.decoders = {name: head.build(config, head.channels_of(config)) for name, head in heads.TABLE.items()
                          if name in config.heads}
         if config.first_guess == "training_mean":
             self.first_guess = {name: outputs.FirstGuess() for name in outputs.FIRST_GUESS_HEADS
@@ -61,7 +63,9 @@ class Network(linen.Module):
                          self.target(frames["target_m"], frames["next_target_m"])]
         if self.config.speed:
             measured.append(self.speed(frames["speed_mps"]))
-        return self.fusion(self.camera(frames, mode), self.lidar(frames, mode), measured, mode, keys)
+        image_map = self.camera(frames, mode) if self.config.camera != NO_SENSOR else None
+        lidar_map = self.lidar(frames, mode) if self.config.lidar != NO_SENSOR else None
+        return self.fusion(image_map, lidar_map, measured, mode, keys)
 
     def observe_step(self, *args):
         return self.transition.observe_step(*args)
@@ -257,7 +261,11 @@ class WorldModel:
 
 def inputs(config: ModelConfig) -> dict[str, tuple[int, ...]]:
     """What a model reads: name of a Batch field -> its shape for one frame."""
-    fields = {**camera.REGISTRY[config.camera].inputs(config), **lidar.REGISTRY[config.lidar].inputs(config)}
+    fields: dict[str, tuple[int, ...]] = {}
+    if config.camera != NO_SENSOR:
+        fields |= camera.REGISTRY[config.camera].inputs(config)
+    if config.lidar != NO_SENSOR:
+        fields |= lidar.REGISTRY[config.lidar].inputs(config)
     if config.route:
         fields["route_map"] = ROUTE_MAP_SIZE
     if config.navigation:

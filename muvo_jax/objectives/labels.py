@@ -31,6 +31,11 @@ def occupancy_labels(occupancy: types.ArrayLike) -> dict[int, types.Array]:
     return {scale: jnp.asarray(occupancy)[..., ::scale, ::scale, ::scale] for scale in SCALES}
 
 
+def map_labels(array: types.ArrayLike) -> dict[int, types.Array]:
+    """A map of classes, distances or numbers [..., H, W] to {scale: [..., H/scale, W/scale]}."""
+    return {scale: jnp.asarray(array)[..., ::scale, ::scale] for scale in SCALES}
+
+
 def _mean_2x2(image: types.Array) -> types.Array:
     *leading, rows, columns, channels = image.shape
     blocks = image.reshape(*leading, rows // 2, 2, columns // 2, 2, channels)

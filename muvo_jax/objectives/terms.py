@@ -14,7 +14,7 @@ import jax.numpy as jnp
 
 from muvo_jax import config as config_lib
 from muvo_jax import types
-from muvo_jax.objectives import chamfer, labels, regression, scal
+from muvo_jax.objectives import chamfer, classification, instances, labels, perceptual, regression, scal, similarity
 
 
 class Sums(Protocol):
@@ -34,6 +34,7 @@ class Inputs:
       batch: has every field that config.TARGETS names for the head.
       model, loss: units and settings.
       keys: typed keys [B], one per sample, for terms that draw.
+      frozen: the network of the perceptual term, None where it is off.
     """
 
     predictions: Mapping[int, types.Array]
@@ -41,6 +42,7 @@ class Inputs:
     model: config_lib.ModelConfig
     loss: config_lib.LossConfig
     keys: types.Array
+    frozen: perceptual.FrozenEncoder | None = None
 
     def truth(self, field: str) -> types.Array:
         """[B, T, ...], a field of the batch that config.TARGETS names for the head."""
@@ -75,6 +77,13 @@ def _image(inputs: Inputs) -> dict[str, Sums]:
     for scale, target in labels.image_labels(inputs.truth("image")).items():
         sums[f"image_{scale}"] = regression.l1_sums(inputs.predictions[scale], target)
         sums[f"image_squared_{scale}"] = regression.l2_sums(inputs.predictions[scale], target)
+        if inputs.loss.image_similarity:
+            sums[f"image_similarity_{scale}"] = similarity.dissimilarity_sums(inputs.predictions[scale], target)
+        if inputs.loss.image_perceptual:
+            if inputs.frozen is None:
+                raise ValueError("losses: loss.image_perceptual is on, but there is no frozen image network. Train "
+                                 "with --perceptual and --backbone-weights=PATH or --perceptual-from=RUN.")
+            sums[f"image_perceptual_{scale}"] = inputs.frozen.distance_sums(inputs.predictions[scale], target)
     return sums
 
 
@@ -92,13 +101,48 @@ def _range_view(inputs: Inputs) -> dict[str, Sums]:
 
 
 def _occupancy(inputs: Inputs) -> dict[str, Sums]:
-    return {f"occupancy_{scale}": scal.occupancy_sums(inputs.predictions[scale], target,
-                                                      inputs.loss.occupancy_unknown == "empty")
-            for scale, target in labels.occupancy_labels(inputs.truth("occupancy")).items()}
+    unknown_is_empty = inputs.loss.occupancy_unknown == "empty"
+    sums: dict[str, Sums] = {}
+    for scale, target in labels.occupancy_labels(inputs.truth("occupancy")).items():
+        sums[f"occupancy_{scale}"] = scal.occupancy_sums(inputs.predictions[scale], target, unknown_is_empty)
+        if inputs.loss.occupancy_dice:
+            sums[f"occupancy_dice_{scale}"] = classification.occupancy_dice_sums(inputs.predictions[scale], target,
+                                                                                 unknown_is_empty)
+    return sums
 
 
 def _action(inputs: Inputs) -> dict[str, Sums]:
     return {"action": regression.l1_sums(inputs.predictions[1], inputs.truth("action"))}
+
+
+def _depth(inputs: Inputs) -> dict[str, Sums]:
+    """In units of range_scale_m, where nothing is measured too, so that the model learns where that is."""
+    scale_m = inputs.model.range_scale_m
+    return {f"depth_{scale}": regression.l1_sums(inputs.predictions[scale] / scale_m, target[..., None] / scale_m)
+            for scale, target in labels.map_labels(inputs.truth("depth_m")).items()}
+
+
+def _semantic(term: str, field: str, share: str) -> Callable[[Inputs], dict[str, Sums]]:
+    """Cross-entropies of a class map; `share` names the field of LossConfig."""
+    def sums(inputs: Inputs) -> dict[str, Sums]:
+        loss = inputs.loss
+        return {f"{term}_{scale}": classification.cross_entropy_sums(
+                    inputs.predictions[scale], target, weights=loss.semantic_weights, top_share=getattr(loss, share))
+                for scale, target in labels.map_labels(inputs.truth(field)).items()}
+    return sums
+
+
+def _birds_eye(inputs: Inputs) -> dict[str, Sums]:
+    loss, count = inputs.loss, config_lib.BIRDS_EYE_CLASSES
+    sums: dict[str, Sums] = {}
+    numbers = labels.map_labels(inputs.truth("birds_eye_instances"))
+    for scale, target in labels.map_labels(inputs.truth("birds_eye_classes")).items():
+        prediction = inputs.predictions[scale]
+        sums[f"birds_eye_{scale}"] = classification.cross_entropy_sums(
+            prediction[..., :count], target, weights=loss.birds_eye_weights, top_share=loss.birds_eye_share)
+        sums[f"birds_eye_centre_{scale}"], sums[f"birds_eye_offset_{scale}"] = instances.sums(
+            prediction[..., count + 2:], prediction[..., count:count + 2], numbers[scale], scale)
+    return sums
 
 
 def _reward(inputs: Inputs) -> dict[str, Sums]:
@@ -120,11 +164,19 @@ def _ego_motion(inputs: Inputs) -> dict[str, Sums]:
 
 
 TABLE: dict[str, HeadTerms] = {
-    "image": HeadTerms(_image, scaled("image", "image_squared")),
+    "image": HeadTerms(_image, scaled("image", "image_squared", "image_similarity", "image_perceptual")),
     "range_view": HeadTerms(_range_view, scaled("range_xyz", "range_depth") | {"chamfer_1": ("chamfer", 1.0)}),
     "occupancy": HeadTerms(_occupancy, scaled("occupancy_cross_entropy", "occupancy_semantic_scal",
-                                              "occupancy_geometric_scal")),
+                                              "occupancy_geometric_scal", "occupancy_dice")),
     "action": HeadTerms(_action, single("action")),
+    "depth": HeadTerms(_depth, scaled("depth")),
+    "semantic_image": HeadTerms(_semantic("semantic_image", "image_classes", "semantic_image_share"),
+                                scaled("semantic_image")),
+    "semantic_range_view": HeadTerms(
+        _semantic("semantic_range_view", "range_view_classes", "semantic_range_view_share"),
+        scaled("semantic_range_view")),
+    "birds_eye": HeadTerms(_birds_eye, scaled("birds_eye", "birds_eye_centre")
+                           | {f"birds_eye_offset_{scale}": ("birds_eye_offset", 1.0) for scale in labels.SCALES}),
     "reward": HeadTerms(_reward, single("reward")),
     "continue": HeadTerms(_continue, {"continue": ("continue_", 1.0)}),
     "ego_motion": HeadTerms(_ego_motion, single("ego_motion") | {"ego_speed": ("ego_motion", 1.0)}),

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 from muvo_jax import config as config_lib
 from muvo_jax import types
 from muvo_jax.model import heads as heads_lib
-from muvo_jax.objectives import kl, terms
+from muvo_jax.objectives import kl, perceptual, terms
 
 
 def term_weights(loss: config_lib.LossConfig, heads: tuple[str, ...]) -> dict[str, float]:
@@ -25,7 +25,8 @@ def term_weights(loss: config_lib.LossConfig, heads: tuple[str, ...]) -> dict[st
 
 
 def loss_sums(predictions: types.Predictions, batch: types.Batch, observed: types.Observed, *,
-              model: config_lib.ModelConfig, loss: config_lib.LossConfig, keys: types.Array) -> dict[str, terms.Sums]:
+              model: config_lib.ModelConfig, loss: config_lib.LossConfig, keys: types.Array,
+              frozen: perceptual.FrozenEncoder | None = None) -> dict[str, terms.Sums]:
     """Reduces predictions and targets to sums that add over samples and devices.
 
     Args:
@@ -34,6 +35,7 @@ def loss_sums(predictions: types.Predictions, batch: types.Batch, observed: type
       observed: posterior and prior of every frame.
       model, loss: weights and units.
       keys: typed keys [B], one per sample (for the optional Chamfer term).
+      frozen: the network of the optional perceptual term.
 
     Raises:
       ValueError: where a head has no target or lacks a scale.
@@ -42,7 +44,7 @@ def loss_sums(predictions: types.Predictions, batch: types.Batch, observed: type
                                                              balance=loss.kl_balance, numerics=model.numerics)}
     for head in model.heads:
         check_head(head, predictions, batch, model)
-        sums |= terms.TABLE[head].sums(terms.Inputs(predictions[head], batch, model, loss, keys))
+        sums |= terms.TABLE[head].sums(terms.Inputs(predictions[head], batch, model, loss, keys, frozen))
     return sums
 
 
@@ -68,12 +70,12 @@ def combine(sums: Mapping[str, terms.Sums], weights: Mapping[str, float]) -> dic
 
 def losses(predictions: types.Predictions, batch: types.Batch, observed: types.Observed, *,
            model: config_lib.ModelConfig, loss: config_lib.LossConfig, keys: types.Array,
-           axis_name: str | None = None) -> dict[str, types.Array]:
+           axis_name: str | None = None, frozen: perceptual.FrozenEncoder | None = None) -> dict[str, types.Array]:
     """Every weighted term (unweighted float32 scalars) and the weighted "total" of a batch.
 
     Arguments as `loss_sums`; with `axis_name` the batch is spread over that axis and the result is that of all of it.
     """
-    sums = loss_sums(predictions, batch, observed, model=model, loss=loss, keys=keys)
+    sums = loss_sums(predictions, batch, observed, model=model, loss=loss, keys=keys, frozen=frozen)
     if axis_name is not None:
         sums = jax.lax.psum(sums, axis_name)
     return combine(sums, term_weights(loss, model.heads))

@@ -112,11 +112,7 @@ def resize_crop(image: np.ndarray, intrinsics: np.ndarray, size: tuple[int, int]
     """
     height, width = image.shape[:2]
     rows, columns = size
-    scaled_height = round(height * columns / width)
-    if scaled_height < rows:
-        raise ValueError(f"image of {height}x{width} pixels scaled to {columns} columns has {scaled_height} rows, "
-                         f"fewer than the {rows} wanted; choose model.image_size with at most "
-                         f"{scaled_height // 32 * 32} rows.")
+    scaled_height = _scaled_height(height, width, size)
     if (scaled_height, columns) != (height, width):
         image = np.asarray(Image.fromarray(image).resize((columns, scaled_height), Image.Resampling.BILINEAR))
     scaled = np.array(intrinsics, np.float32)
@@ -124,3 +120,26 @@ def resize_crop(image: np.ndarray, intrinsics: np.ndarray, size: tuple[int, int]
     scaled[1] *= scaled_height / height
     scaled[1, 2] -= scaled_height - rows
     return np.ascontiguousarray(image[scaled_height - rows:]), scaled
+
+
+def resize_crop_nearest(picture: np.ndarray, size: tuple[int, int]) -> np.ndarray:
+    """As `resize_crop` for what must not be mixed, classes or distances [H, W]: the nearest pixel, in its dtype.
+
+    Raises:
+      ValueError: as resize_crop.
+    """
+    (height, width), (rows, columns) = picture.shape, size
+    scaled_height = _scaled_height(height, width, size)
+    row = ((np.arange(scaled_height - rows, scaled_height) + 0.5) * height / scaled_height).astype(np.intp)
+    column = ((np.arange(columns) + 0.5) * width / columns).astype(np.intp)
+    return np.ascontiguousarray(picture[row[:, None], column[None]])
+
+
+def _scaled_height(height: int, width: int, size: tuple[int, int]) -> int:
+    rows, columns = size
+    scaled_height = round(height * columns / width)
+    if scaled_height < rows:
+        raise ValueError(f"image of {height}x{width} pixels scaled to {columns} columns has {scaled_height} rows, "
+                         f"fewer than the {rows} wanted; choose model.image_size with at most "
+                         f"{scaled_height // 32 * 32} rows.")
+    return scaled_height

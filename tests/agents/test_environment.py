@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from worlds import CONFIG, HORIZON, MODEL, STARTS, bank, make, variables
+from worlds import CONFIG, HORIZON, MODEL, NO_COLLISION, STARTS, bank, make, variables
 
 from muvo_jax.agents import environment as environment_lib
 from muvo_jax.agents import rewards
@@ -38,6 +38,21 @@ def test_without_noise_a_step_is_the_models_and_the_car_moves_by_its_kinematics(
     start_mps = bank().speed_mps[state.start]
     np.testing.assert_allclose(after.motion.speed_mps, start_mps + 0.2 * 1.5, rtol=1e-5)
     np.testing.assert_allclose(transition.terms["progress_m"], 0.2 * (start_mps + 0.15), rtol=0.1)
+
+
+def test_the_2d_latent_is_driven_by_a_policy_that_reads_one_vector():
+    model = world_model.WorldModel(dataclasses.replace(CONFIG, latent="2d", heads=("action",)))
+    draw = lambda leaf: jax.random.normal(jax.random.key(leaf.size), leaf.shape)
+    starts = environment_lib.StartBank(jax.tree.map(draw, model.initial_state(STARTS)), bank().speed_mps,
+                                       bank().route_map)
+    environment = environment_lib.Environment(model, periods=2, reward_config=NO_COLLISION)
+    params = environment.params(model.init(jax.random.key(0)), starts, horizon=2)
+    observation, state = environment.reset(jax.random.key(1), params)
+    assert observation.shape == (model.policy_feature_channels,) and len(model.feature_shape) == 2
+    policy = jax.tree_util.Partial(lambda key, seen: jnp.tanh(seen[:2]))
+    states, transitions = environment_lib.play(environment, params, jax.random.key(2), state, policy, 2)
+    assert transitions.observation.shape == (2, model.policy_feature_channels)
+    assert np.isfinite(transitions.reward).all() and states.time.tolist() == [1, 2]
 
 
 def test_many_cars_restart_one_by_one():

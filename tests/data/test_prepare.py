@@ -1,5 +1,6 @@
 """From raw frames to model inputs, and from presets to recordings."""
 
+import copy
 import dataclasses
 
 import numpy as np
@@ -22,8 +23,9 @@ def plain_recording(tmp_path):
 
 
 def with_description(recording, **changes):
-    recording.description = dataclasses.replace(recording.description, **changes)
-    return recording
+    changed = copy.copy(recording)
+    changed.description = dataclasses.replace(recording.description, **changes)
+    return changed
 
 
 def test_kitti_gives_the_town_preset_its_sensors(kitti_recording):
@@ -87,9 +89,34 @@ def test_a_small_recorded_grid_gets_a_shallower_voxel_decoder(plain_recording):
 
 
 def test_what_every_model_needs(plain_recording):
-    without = plain_recording.description.modalities - {"points_m"}
-    with pytest.raises(schema.DataError, match="lacks points_m; every model needs camera, lidar and actions"):
-        prepare.adapt(presets.get("tiny"), with_description(plain_recording, modalities=without))
+    for lacking in ({"points_m", "image"}, {"action"}):
+        without = plain_recording.description.modalities - lacking
+        with pytest.raises(schema.DataError, match="every model needs actions and, with their sensor's description"):
+            prepare.adapt(presets.get("tiny"), with_description(plain_recording, modalities=without))
+
+
+def test_a_model_without_the_sensor_that_a_recording_lacks(plain_recording):
+    tiny, modalities = presets.get("tiny"), plain_recording.description.modalities
+    blind = with_description(plain_recording, modalities=modalities - {"image", "intrinsics"}, camera=None)
+    config, notes = prepare.adapt(tiny, blind)
+    assert (config.model.camera, config.model.lidar) == ("none", "rv")
+    assert config.model.heads == ("range_view", "occupancy", "action")
+    assert "no images are recorded: the model has no camera input and no head image." in notes
+    assert prepare.adapt(config, blind).config == config
+    raw = plain_recording.read(plain_recording.sequences[0], 0)
+    assert not {"image", "intrinsics", "camera_to_ego"} & prepare.prepare_frame(raw, config).keys()
+
+    config, _ = prepare.adapt(tiny, with_description(plain_recording, modalities=modalities - {"points_m"}))
+    assert (config.model.camera, config.model.lidar) == ("wob", "none")
+    assert config.model.heads == ("image", "occupancy", "action")  # occupancy is recorded
+    config, notes = prepare.adapt(tiny, with_description(plain_recording, modalities=modalities - {
+        "points_m", "occupancy"}, lidar=None, voxels=None))
+    assert config.model.heads == ("image", "action")
+    assert "no lidar scans are recorded: the model has no lidar input and no head occupancy, range_view." in notes
+    raw.pop("points_m")
+    assert "range_view" not in prepare.prepare_frame(raw, config)
+    with pytest.raises(schema.DataError, match="lacks camera: nothing is left to see"):
+        prepare.adapt(config_lib.override(tiny, "model.lidar", "none"), blind)
 
 
 def test_a_flat_image_is_taken_wider_than_the_preset(kitti_recording):

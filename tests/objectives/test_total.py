@@ -120,6 +120,6 @@ def test_terms_and_weights_must_be_the_same_set():
 
 def test_every_head_has_a_decoder_targets_and_terms_of_one_name():
     assert set(config_lib.TARGETS) == set(heads.TABLE)
-    assert set(terms.TABLE) == set(heads.TABLE) - {"birds_eye"}
+    assert set(terms.TABLE) == set(heads.TABLE)
     fields = {field.name for field in dataclasses.fields(config_lib.LossConfig)}
     assert {field for row in terms.TABLE.values() for field, _ in row.weights.values()} <= fields

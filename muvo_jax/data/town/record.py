@@ -88,8 +88,10 @@ def fingerprint(town_config: settings.TownConfig, size: str) -> str:
     """Names everything that decides the bytes of a recording: town, splits, weathers and version."""
     splits = {name: dataclasses.asdict(split) for name, split in settings.SIZES[size].items()}
     weathers = {name: dataclasses.asdict(weather) for name, weather in settings.WEATHERS.items()}
-    content = json.dumps([RECORDING_VERSION, WARM_UP_FRAMES, dataclasses.asdict(town_config), splits, weathers],
-                         sort_keys=True)
+    town = dataclasses.asdict(town_config)
+    if not town_config.labels:
+        del town["labels"]  # a recording without them is named as it was before there were any
+    content = json.dumps([RECORDING_VERSION, WARM_UP_FRAMES, town, splits, weathers], sort_keys=True)
     return f"{size}-{hashlib.sha256(content.encode()).hexdigest()[:12]}"
 
 

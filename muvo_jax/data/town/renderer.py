@@ -12,7 +12,7 @@ import numpy as np
 
 from muvo_jax.data.town import boxes as box_lib
 from muvo_jax.data.town import ground as ground_lib
-from muvo_jax.data.town import raycast, settings, shading
+from muvo_jax.data.town import labels, raycast, settings, shading
 from muvo_jax.ops import camera as camera_ops
 from muvo_jax.ops import range_view as range_ops
 from muvo_jax.ops import voxels as voxel_ops
@@ -64,7 +64,8 @@ class Renderer:
         Returns:
           image uint8 [H, W, 3]; depth_m float32 [H, W] along the optical axis, infinite in the sky; classes uint8
           [H, W], indices into boxes.CLASSES; range_view float32 [rows, columns, 4] as in muvo_jax.types.Batch, and
-          points_m float32 [N, 3], its returns (ego frame).
+          points_m float32 [N, 3], its returns (ego frame). With TownConfig.labels also point_tags uint8 [N], the class
+          of each point, and birds_eye_classes and birds_eye_instances [X, Y], see labels.ground_plan.
         """
         x, y, yaw_rad = (float(value) for value in pose)
         cosine, sine = np.cos(yaw_rad), np.sin(yaw_rad)
@@ -77,9 +78,16 @@ class Renderer:
         hits = raycast.cast(self.camera_fan, origin_m, yaw_rad, boxes)
         image, classes = shading.shade(self.camera_fan, hits, origin_m, yaw_rad, boxes, self.ground, weather,
                                        float(self.intrinsics[0, 0]), np.random.default_rng([*noise_seed, 11]))
-        view = self._scan(origin_m, yaw_rad, boxes)
-        return {"image": image, "depth_m": np.ascontiguousarray((hits.distance_m / self._stretch[:, None]).T),
+        scan = raycast.cast(self.lidar_fan, origin_m, yaw_rad, boxes)
+        view = self._range_view(scan)
+        seen = {"image": image, "depth_m": np.ascontiguousarray((hits.distance_m / self._stretch[:, None]).T),
                 "classes": classes, "range_view": view, "points_m": range_ops.to_points(view)}
+        if self.config.labels:
+            tags = labels.ray_classes(self.lidar_fan, scan, origin_m, yaw_rad, boxes, self.ground)
+            seen["point_tags"] = tags[view[..., 3] > 0.0]
+            seen["birds_eye_classes"], seen["birds_eye_instances"] = labels.ground_plan(pose, boxes, self.ground,
+                                                                                        self.config.voxels)
+        return seen
 
     def occupancy(self, seen: Mapping[str, Any]) -> np.ndarray:
         """The occupancy target from fused depth map and lidar points, uint8 [X, Y, Z] with 0, 1 and 255 (unknown).
@@ -101,9 +109,9 @@ class Renderer:
         return np.where(occupied > 0, np.uint8(voxel_ops.OCCUPIED),
                         np.where(empty, np.uint8(voxel_ops.EMPTY), np.uint8(voxel_ops.UNKNOWN)))
 
-    def _scan(self, origin_m: np.ndarray, yaw_rad: float, boxes: box_lib.Boxes) -> np.ndarray:
+    def _range_view(self, scan: raycast.Hits) -> np.ndarray:
         """The range view that range_view.project would make of the lidar's points: beams are pixel centres."""
-        distance_m = raycast.cast(self.lidar_fan, origin_m, yaw_rad, boxes).distance_m.T
+        distance_m = scan.distance_m.T
         hit = np.isfinite(distance_m)
         distance_m = np.where(hit, distance_m, 0)
         mount_m = np.asarray(self.config.lidar.position_m, np.float32)

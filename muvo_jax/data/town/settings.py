@@ -100,6 +100,7 @@ class TownConfig:
       route_m: length of the planned route; the drive ends with it.
       action_noise: standard deviation of the expert's smooth (acceleration, steering) noise.
       lane_wander_m: amplitude of the expert's slow swaying about the middle of the lane.
+      labels: whether classes of lidar points and the ground plan from above are recorded too (labels.py).
     """
 
     seed: int = 0
@@ -122,6 +123,7 @@ class TownConfig:
     route_m: float = 800.0
     action_noise: tuple[float, float] = (0.12, 0.03)
     lane_wander_m: float = 0.35
+    labels: bool = False
 
     def __post_init__(self):
         if self.contract.kinematics != "bicycle":
@@ -135,4 +137,5 @@ def from_config(config: config_lib.Config) -> TownConfig:
     """The town whose sensors have exactly the sizes that the model of `config` wants."""
     height, width = config.model.image_size
     return TownConfig(seed=config.data.town_seed, camera_height_px=height, camera_width_px=width,
-                      lidar=config.model.range_view, voxels=config.model.voxels, contract=config.contract)
+                      lidar=config.model.range_view, voxels=config.model.voxels, contract=config.contract,
+                      labels=not {"semantic_range_view", "birds_eye"}.isdisjoint(config.model.heads))

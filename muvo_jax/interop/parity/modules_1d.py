@@ -98,7 +98,7 @@ def decoded(context: cases.Context) -> Checks:
         for scale, value in drawing.run(module, rows, where=where).items():
             yield cases.Check(f"{name}_{scale}", drawing.channels_first(value), tolerance)
     head = heads.TABLE["birds_eye"]
-    birds_eye = drawing.run(head.build(CONFIG, head.channels), state[:1], where="decoders_birds_eye/")
+    birds_eye = drawing.run(head.build(CONFIG, head.channels_of(CONFIG)), state[:1], where="decoders_birds_eye/")
     for entry, value in drawing.birds_eye_entries("bev_decoder", birds_eye, 1):
         yield cases.Check(entry, value, TOLERANCE)
 

@@ -71,8 +71,9 @@ def decoded(context: cases.Context) -> Checks:
         for scale, value in drawing.run(module, tokens, where=where).items():
             tolerance = STYLED_TOLERANCE if name == "voxel_decoder" else TOLERANCE
             yield cases.Check(f"{name}/{entry}_{scale}", drawing.channels_first(value), tolerance)
-    birds_eye = token_decoders.TokenDecoder(heads.TABLE["birds_eye"].channels, width, width, 1,
-                                            head=decoders.BirdsEyeHead)  # the pack feeds the ground plan itself
+    channels = heads.TABLE["birds_eye"].channels_of(CONFIG)
+    birds_eye = token_decoders.TokenDecoder(channels, width, width, 1, head=decoders.BirdsEyeHead)
+    # The pack feeds the ground plan itself.
     plan = drawing.channels_last(context.draw("bev_decoder_in", (1, CONFIG.token_channels, 12, 12), "normal"))
     for entry, value in drawing.birds_eye_entries("bev_decoder", drawing.run(
             birds_eye, plan, where="decoders_birds_eye/"), 1):

@@ -1,0 +1,109 @@
+"""Terms of the optional heads on maps that can be worked out by hand; the parity packs have the reference's numbers."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from muvo_jax import config as config_lib
+from muvo_jax import types
+from muvo_jax.nn import resnet
+from muvo_jax.objectives import classification, instances, perceptual, similarity, terms
+
+MODEL, LOSS = config_lib.ModelConfig(), config_lib.LossConfig()
+ROWS, COLUMNS = 8, 16
+
+
+def values(head, predictions, loss=LOSS, axis_name=None, frozen=None, **fields):
+    """{term: value} of one head for a batch of these fields."""
+    lead = next(iter(fields.values())).shape[:2]
+    batch = types.Batch(action=np.zeros((*lead, 2), np.float32), is_first=np.zeros(lead, bool), **fields)
+    sums = terms.TABLE[head].sums(terms.Inputs(predictions, batch, MODEL, loss, None, frozen))
+    sums = sums if axis_name is None else jax.lax.psum(sums, axis_name)
+    return {term: value for name, part in sums.items() for term, value in part.terms(name).items()}
+
+
+def test_cross_entropy_counts_weights_and_the_worst_pixels():
+    logits = jnp.zeros((1, 1, 4, 2)).at[0, 0, 3].set(jnp.array([4.0, 0.0]))
+    target = np.array([[[0, 1, 255, 1]]], np.uint8)
+    worst = np.log1p(np.exp(4.0))  # class 1 where the logits say class 0
+    mean = lambda **options: float(classification.cross_entropy_sums(logits, target, **options).value())
+    np.testing.assert_allclose(mean(), (2 * np.log(2) + worst) / 3, rtol=1e-6)  # 255 does not count
+    np.testing.assert_allclose(mean(weights=(1.0, 3.0)), (4 * np.log(2) + 3 * worst) / 3, rtol=1e-6)
+    np.testing.assert_allclose(mean(top_share=0.25), worst, rtol=1e-6)
+    with pytest.raises(ValueError, match="3 class weights for 2 classes"):
+        mean(weights=(1.0, 1.0, 1.0))
+
+
+def test_instances_have_a_centre_and_each_cell_knows_the_way():
+    numbers = np.zeros((1, 6, 8), np.int32)
+    numbers[0, 1:4, 2:5], numbers[0, 5, 7] = 1, 2
+    centre, offset, inside = jax.jit(lambda numbers: instances.targets(numbers, 2.0))(numbers)
+    assert centre[0, 2, 3, 0] == centre[0, 5, 7, 0] == 1.0
+    np.testing.assert_allclose(centre[0, 2, 4, 0], np.exp(-1 / 4), rtol=1e-6)
+    np.testing.assert_array_equal(offset[0, 1, 2], (1, 1))
+    np.testing.assert_array_equal(offset[0, 5, 7], (0, 0))
+    np.testing.assert_array_equal(inside, numbers > 0)
+
+
+def test_structural_similarity_of_equal_pictures_is_one():
+    picture = jax.random.uniform(jax.random.key(0), (2, 16, 20, 3))
+    np.testing.assert_allclose(similarity.frame_similarity(picture, picture), np.ones((2, 3)), atol=1e-5)
+    assert float(similarity.frame_similarity(picture, 1.0 - picture).max()) < 0.2
+    with pytest.raises(ValueError, match="at least 11 on a side"):
+        similarity.frame_similarity(picture[:, :8], picture[:, :8])
+
+
+def test_optional_heads_do_not_depend_on_how_devices_share_the_batch():
+    random = np.random.default_rng(0)
+    lead = (4, 1)
+    maps = {"image_classes": random.integers(0, 3, (*lead, ROWS, COLUMNS)).astype(np.uint8),
+            "birds_eye_classes": random.integers(0, 8, (*lead, ROWS, COLUMNS)).astype(np.uint8),
+            "birds_eye_instances": random.integers(0, 3, (*lead, ROWS, COLUMNS)).astype(np.int32),
+            "occupancy": random.integers(0, 2, (*lead, ROWS, COLUMNS, 4)).astype(np.uint8)}
+    maps["image_classes"][0], maps["birds_eye_instances"][0] = 255, 0  # unevenly spread
+    draw = lambda *shape: {f: random.normal(size=(*lead, *(side // f for side in shape[:-1]), shape[-1])
+                                            ).astype(np.float32) for f in (1, 2, 4)}
+    loss = dataclasses.replace(LOSS, occupancy_dice=0.1)
+    case = ({"semantic_image": draw(ROWS, COLUMNS, 3), "birds_eye": draw(ROWS, COLUMNS, 11),
+             "occupancy": draw(ROWS, COLUMNS, 4, 2)}, maps)
+
+    def every(case, axis_name=None):
+        predictions, maps = case
+        fields = {"semantic_image": ("image_classes",), "birds_eye": ("birds_eye_classes", "birds_eye_instances"),
+                  "occupancy": ("occupancy",)}
+        return {term: value for head, names in fields.items()
+                for term, value in values(head, predictions[head], loss, axis_name,
+                                          **{name: maps[name] for name in names}).items()}
+
+    whole = jax.jit(every)(case)
+    assert set(whole) == {term for head in case[0] for term in terms.TABLE[head].weights}
+    parts = jax.tree.map(lambda leaf: leaf.reshape(2, 2, *leaf.shape[1:]), case)
+    spread = jax.jit(jax.vmap(lambda part: every(part, "parts"), axis_name="parts"))(parts)
+    for name, value in whole.items():
+        np.testing.assert_allclose(spread[name], np.full(2, value), rtol=2e-5, err_msg=name)
+
+
+def test_depth_is_learned_in_units_of_the_range_where_nothing_is_too():
+    depth_m = np.full((1, 1, ROWS, COLUMNS), -1.0, np.float32)
+    depth_m[0, 0, 0, 0] = 99.0
+    predictions = {f: jnp.full((1, 1, ROWS // f, COLUMNS // f, 1), -1.0) for f in (1, 2, 4)}
+    got = values("depth", predictions, depth_m=depth_m)
+    np.testing.assert_allclose(got["depth_1"], 100.0 / 50.0 / (ROWS * COLUMNS), rtol=1e-6)
+
+
+def test_the_perceptual_term_needs_a_frozen_network_and_vanishes_for_equal_pictures():
+    image = np.random.default_rng(1).integers(0, 256, (1, 1, 32, 32, 3)).astype(np.uint8)
+    loss = dataclasses.replace(LOSS, image_perceptual=0.1)
+    exact = {f: jnp.asarray(image.reshape(1, 1, 32 // f, f, 32 // f, f, 3).mean(axis=(3, 5)) / 255.0, jnp.float32)
+             for f in (1, 2, 4)}
+    with pytest.raises(ValueError, match="--perceptual-from=RUN"):
+        values("image", exact, loss, image=image)
+    network = resnet.ResNet18(4, (1, 2))
+    shapes = jax.eval_shape(lambda: network.init(jax.random.key(0), jnp.zeros((1, 32, 32, 3)), perceptual.norm.Mode()))
+    weights = jax.tree.map(lambda leaf: np.full(leaf.shape, 0.1, np.float32), shapes)
+    frozen = perceptual.FrozenEncoder(network, weights, "made up")
+    term = jax.jit(lambda picture: values("image", picture, loss, frozen=frozen, image=image)["image_perceptual_1"])
+    assert term(exact) < 1e-8 < term({f: 0.5 * picture for f, picture in exact.items()})

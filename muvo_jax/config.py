@@ -228,6 +228,7 @@ class DataConfig:
       context, horizon: evaluation observes `context` frames and imagines `horizon` more.
       town_seed, town_size: which town, and how much of it ("default", "tiny").
       cache_gib: decoded frames are kept in memory up to this size.
+      workers: threads that read and decode batches ahead; 0 takes one for each processor but one, 2 to 16.
       skip_corrupt_shards: leave damaged shards of a packed recording out, counted, instead of stopping.
     """
 
@@ -240,12 +241,15 @@ class DataConfig:
     town_seed: int = 0
     town_size: str = "default"
     cache_gib: float = 1.5
+    workers: int = 0
     skip_corrupt_shards: bool = False
 
     def __post_init__(self):
         for name in ("frames", "stride", "context", "horizon"):
             if getattr(self, name) < 1:
                 raise ValueError(f"data.{name} is {getattr(self, name)}; it must be at least 1.")
+        if self.workers < 0:
+            raise ValueError(f"data.workers is {self.workers}; it must be at least 0 (0 chooses).")
 
 
 @dataclasses.dataclass(frozen=True)

@@ -23,9 +23,9 @@ from muvo_jax.viz import curves, sheets
 PERCEPTUAL_WEIGHT = 0.1  # the reference's
 # Flags that change one field of the configuration.
 _FIELDS = {"lidar": "model.lidar", "camera": "model.camera", "fusion": "model.fusion", "latent": "model.latent",
-           "backbone": "model.backbone", "data": "data.path", "data_camera": "data.camera", "steps": "train.steps",
-           "batch": "train.batch", "accumulate": "optimizer.accumulate", "frames": "data.frames",
-           "stride": "data.stride", "context": "data.context", "horizon": "data.horizon",
+           "backbone": "model.backbone", "data": "data.path", "data_camera": "data.camera", "workers": "data.workers",
+           "steps": "train.steps", "batch": "train.batch", "accumulate": "optimizer.accumulate",
+           "frames": "data.frames", "stride": "data.stride", "context": "data.context", "horizon": "data.horizon",
            "learning_rate": "optimizer.learning_rate", "seed": "train.seed", "parallel": "train.parallel"}
 
 
@@ -76,6 +76,8 @@ class Options:
     """"town" (built in) or the folder of a recording; its kind is recognised."""
     data_camera: Annotated[str | None, command_line.shown("NAME", "the reader's choice")] = None
     """Which camera of the recording, where it has several (KITTI: image_00 to image_03)."""
+    workers: Annotated[int | None, command_line.shown("N", "one a processor but one, 2 to 16")] = None
+    """Threads that read and decode ahead."""
     name: Annotated[str | None, command_line.shown("NAME", "made of data, preset and fusion")] = None
     """Of the run."""
     runs_dir: pathlib.Path = pathlib.Path("runs")

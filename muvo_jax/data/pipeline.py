@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import os
 import queue
 import threading
 import time
@@ -20,8 +21,8 @@ from muvo_jax.data import ego_motion, prepare, schema
 from muvo_jax.data import windows as windows_lib
 
 State = dict[str, Any]  # plain JSON types
-_READ_THREADS = 2
-_READ_AHEAD = 4  # batches
+_READ_AHEAD = 4  # batches, at least
+_FEWEST_WORKERS, _MOST_WORKERS = 2, 16
 _UNTIMED = ("intrinsics", "camera_to_ego")
 _HOST_ONLY = ("timestamp_s", "frame_id")
 _Item = TypeVar("_Item")
@@ -106,7 +107,9 @@ class TrainBatches:
         # There is no remainder to drop; without the flag Grain's length of batches of one overflows.
         dataset = grain.MapDataset.source(windows).seed(seed).shuffle().repeat().batch(
             size, drop_remainder=True, batch_fn=lambda chosen: frames.batch([chosen[index] for index in share]))
-        options = grain.ReadOptions(num_threads=_READ_THREADS, prefetch_buffer_size=_READ_AHEAD)
+        # Threads, not processes: decoding and NumPy let go of the interpreter, and all share one cache of frames.
+        threads = data.workers or default_workers()
+        options = grain.ReadOptions(num_threads=threads, prefetch_buffer_size=max(_READ_AHEAD, threads))
         self._iterator = iter(dataset.to_iter_dataset(options))
         if start_state is not None:
             if start_state.get("identity") != self._identity:
@@ -123,6 +126,12 @@ class TrainBatches:
     def get_state(self) -> State:
         """Where the stream stands; plain JSON types."""
         return {"identity": dict(self._identity), "position": self._iterator.get_state()}
+
+
+def default_workers() -> int:
+    """One for each processor this process may use but one, which is left to the training step; 2 to 16."""
+    usable = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    return min(max(usable - 1, _FEWEST_WORKERS), _MOST_WORKERS)
 
 
 def train_batches(frames: Frames, *, seed: int, batch: int | None = None,

@@ -228,6 +228,7 @@ class DataConfig:
       context, horizon: evaluation observes `context` frames and imagines `horizon` more.
       town_seed, town_size: which town, and how much of it ("default", "tiny").
       cache_gib: decoded frames are kept in memory up to this size.
+      workers: threads that read and decode batches ahead; 0 takes one for each processor but one, 2 to 16.
       skip_corrupt_shards: leave damaged shards of a packed recording out, counted, instead of stopping.
     """
 
@@ -240,12 +241,15 @@ class DataConfig:
     town_seed: int = 0
     town_size: str = "default"
     cache_gib: float = 1.5
+    workers: int = 0
     skip_corrupt_shards: bool = False
 
     def __post_init__(self):
         for name in ("frames", "stride", "context", "horizon"):
             if getattr(self, name) < 1:
                 raise ValueError(f"data.{name} is {getattr(self, name)}; it must be at least 1.")
+        if self.workers < 0:
+            raise ValueError(f"data.workers is {self.workers}; it must be at least 0 (0 chooses).")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -261,6 +265,8 @@ class TrainConfig:
       observe_frames: so many frames of a training window are observed, the rest imagined from the last of them; 0
         observes all.
       parallel: "auto" uses shard_map over all devices where there is more than one.
+      backbone_weights: file of an image network that fresh encoders start from; "" for none.
+      perceptual_from: such a file, or a run whose image encoder is taken, for the perceptual term; "" for none.
     """
 
     steps: int = 50_000
@@ -277,6 +283,8 @@ class TrainConfig:
     remat: bool = False
     decode_frames: int = 0
     observe_frames: int = 0
+    backbone_weights: str = ""
+    perceptual_from: str = ""
 
 
 @dataclasses.dataclass(frozen=True)

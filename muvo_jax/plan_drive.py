@@ -170,9 +170,10 @@ def observation(town: simulator.Town, state: simulator.TownState, config: config
 
 
 def town_truth(town: simulator.Town, state: simulator.TownState) -> dict[str, np.ndarray]:
-    """What the sensors show, and the occupancy, in the units of types.Batch."""
+    """What the sensors show, the occupancy, and of the motion the speed, in the units of types.Batch."""
     seen = town.render(state)
-    return {"image": seen["image"], "range_view": seen["range_view"], "occupancy": town.occupancy(seen)}
+    return {"image": seen["image"], "range_view": seen["range_view"], "occupancy": town.occupancy(seen),
+            "ego_motion": np.array([0.0, 0.0, 0.0, seen["speed_mps"]], np.float32)}
 
 
 def film(loaded: checkpoint.LoadedRun, town: simulator.Town, drive: closed_loop.Drive,

@@ -15,14 +15,17 @@ import tyro
 
 from muvo_jax import command_line, config_json, dream, evaluate, presets
 from muvo_jax import config as config_lib
-from muvo_jax.training import checkpoint, loop, run_folder, screen, validation
+from muvo_jax.interop import backbones
+from muvo_jax.objectives import perceptual
+from muvo_jax.training import checkpoint, loop, run_folder, screen, start, validation
 from muvo_jax.viz import curves, sheets
 
+PERCEPTUAL_WEIGHT = 0.1  # the reference's
 # Flags that change one field of the configuration.
 _FIELDS = {"lidar": "model.lidar", "camera": "model.camera", "fusion": "model.fusion", "latent": "model.latent",
-           "backbone": "model.backbone", "data": "data.path", "data_camera": "data.camera", "steps": "train.steps",
-           "batch": "train.batch", "accumulate": "optimizer.accumulate", "frames": "data.frames",
-           "stride": "data.stride", "context": "data.context", "horizon": "data.horizon",
+           "backbone": "model.backbone", "data": "data.path", "data_camera": "data.camera", "workers": "data.workers",
+           "steps": "train.steps", "batch": "train.batch", "accumulate": "optimizer.accumulate",
+           "frames": "data.frames", "stride": "data.stride", "context": "data.context", "horizon": "data.horizon",
            "learning_rate": "optimizer.learning_rate", "seed": "train.seed", "parallel": "train.parallel"}
 
 
@@ -54,6 +57,13 @@ class Options:
     """What is predicted, exactly: of image, range_view, occupancy, action and the optional heads (docs/variants.md)."""
     with_heads: Annotated[str | None, command_line.shown("NAME,...", "none")] = None
     """Heads beside those of the preset."""
+    backbone_weights: Annotated[pathlib.Path | None, command_line.shown("PATH", "none")] = None
+    """Start the encoders from an image network: a .pth or .safetensors file of ResNet-18 (torchvision's or timm's
+    names) or MobileViT-V2 (timm's), whichever --backbone says. Nothing is downloaded."""
+    perceptual: tyro.conf.FlagCreatePairsOff[bool] = False
+    """Compare pictures by the maps of a frozen network too: that of --backbone-weights or of --perceptual-from."""
+    perceptual_from: Annotated[pathlib.Path | None, command_line.shown("RUN", "none")] = None
+    """The frozen network is the image encoder of this run (or in this file)."""
     occupancy: tyro.conf.FlagCreatePairsOff[bool] = False
     """Predict occupancy, whatever the preset says."""
     no_occupancy: tyro.conf.FlagCreatePairsOff[bool] = False
@@ -66,6 +76,8 @@ class Options:
     """"town" (built in) or the folder of a recording; its kind is recognised."""
     data_camera: Annotated[str | None, command_line.shown("NAME", "the reader's choice")] = None
     """Which camera of the recording, where it has several (KITTI: image_00 to image_03)."""
+    workers: Annotated[int | None, command_line.shown("N", "one a processor but one, 2 to 16")] = None
+    """Threads that read and decode ahead."""
     name: Annotated[str | None, command_line.shown("NAME", "made of data, preset and fusion")] = None
     """Of the run."""
     runs_dir: pathlib.Path = pathlib.Path("runs")
@@ -122,7 +134,7 @@ def configure(options: Options) -> tuple[config_lib.Config, dict[str, Any], path
     if options.resume and options.init:
         raise ValueError("--resume and --init contradict each other: a resumed run has weights of its own.")
     chosen = {field: getattr(options, flag) for flag, field in _FIELDS.items() if getattr(options, flag) is not None}
-    chosen = _variant_settings(options) | chosen | command_line.parse_settings(options.set)
+    chosen = _variant_settings(options) | _network_settings(options) | chosen | command_line.parse_settings(options.set)
     base = presets.get(options.preset or "town")
     folder = options.runs_dir / (options.name or default_name(options))
     if options.resume:
@@ -168,6 +180,47 @@ def _variant_settings(options: Options) -> dict[str, str]:
     return {f"model.{flag}": value for flag, value in parts.items()}
 
 
+def _network_settings(options: Options) -> dict[str, Any]:
+    """What --backbone-weights, --perceptual and --perceptual-from set.
+
+    Raises:
+      ValueError: where they contradict other flags, or the perceptual term has no network.
+    """
+    settings: dict[str, Any] = {}
+    if options.backbone_weights:
+        if options.init or options.resume:
+            raise ValueError(f"--backbone-weights and --{'init' if options.init else 'resume'} contradict each other: "
+                             f"the encoders have weights then. Give one of them.")
+        settings["train.backbone_weights"] = str(options.backbone_weights.expanduser().resolve())
+    if options.perceptual or options.perceptual_from:
+        source = options.perceptual_from or options.backbone_weights
+        if source is None:
+            raise ValueError("--perceptual compares pictures by the maps of a trained image network, and there is "
+                             "none: give --backbone-weights=PATH (a ResNet-18 of ImageNet, say) or "
+                             "--perceptual-from=RUN (one of your runs).")
+        settings |= {"loss.image_perceptual": PERCEPTUAL_WEIGHT,
+                     "train.perceptual_from": str(source.expanduser().resolve())}
+    return settings
+
+
+def frozen_encoder(config: config_lib.Config) -> perceptual.FrozenEncoder | None:
+    """The network of the perceptual term; None where the term is off.
+
+    Raises:
+      ValueError, CheckpointError: where there is none, or it cannot be read.
+    """
+    if not config.loss.image_perceptual:
+        return None
+    if not config.train.perceptual_from:
+        raise ValueError("loss.image_perceptual is on, but train.perceptual_from names no network. Give --perceptual "
+                         "with --backbone-weights=PATH or --perceptual-from=RUN.")
+    path = pathlib.Path(config.train.perceptual_from)
+    if not path.is_dir():
+        return backbones.frozen_encoder(backbones.read(path))
+    loaded = checkpoint.load_run(path)
+    return backbones.frozen_encoder_of_run(loaded.variables, loaded.config.model, f"step {loaded.step} of {path}")
+
+
 def _heads(options: Options, heads: Sequence[str]) -> tuple[str, ...] | None:
     """The heads that the flags make of those of the preset, None where no flag speaks of heads.
 
@@ -208,12 +261,22 @@ def train(options: Options, show: screen.Screen) -> None:
     outcome = loop.train(loop.Job(
         config=config, folder=folder, open_recording=lambda: command_line.open_data(config, show), chosen=tuple(chosen),
         resume=options.resume, resume_command=resume_command, started_s=command_line.process_start_s(),
-        init=options.init, preview=draw_preview), show)
+        init=options.init, pretrained=_pretrained(config, options.resume), frozen=frozen_encoder(config),
+        preview=draw_preview), show)
     draw_curves(folder)
     if outcome.stopped or not options.evaluate:
         return
     evaluate.evaluate(evaluate.Options(run=folder), show)
     dream.dream(dream.Options(run=folder), show)
+
+
+def _pretrained(config: config_lib.Config, resume: bool) -> start.Pretrained | None:
+    """Fills a fresh model's encoders from the file that the config names; a resumed run hardly needs it any more."""
+    path = config.train.backbone_weights
+    if not path:
+        return None
+    backbone = None if resume else backbones.read(path)
+    return lambda variables, model: backbones.load_into(variables, backbone or backbones.read(path), model)
 
 
 def draw_preview(folder: pathlib.Path, validator: validation.Validator, variables, name: str) -> None:

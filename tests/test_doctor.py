@@ -37,6 +37,19 @@ def test_problems_are_reported_with_pictures_and_exit_code(tmp_path, capsys):
         assert np.asarray(Image.open(tmp_path / "out" / name)).std() > 1
 
 
+def test_times_out_of_order_are_named_by_file_and_line(tmp_path, capsys):
+    table = writers.write_plain(tmp_path / "plain") / "train/a/frames.csv"
+    header, first, second, *rest = table.read_text().splitlines()
+    table.write_text("\n".join([header, second, first, *rest]) + "\n")
+    assert run(tmp_path / "plain", f"--out={tmp_path / 'out'}") == 1
+    assert f"{table}, line 3: time 0.000 s does not come after" in capsys.readouterr().err
+    stamps = writers.write_kitti(tmp_path / "kitti") / "image_02/timestamps.txt"
+    lines = stamps.read_text().splitlines()
+    stamps.write_text("\n".join([*lines[:4], lines[5], lines[4], *lines[6:]]) + "\n")
+    assert run(tmp_path / "kitti", f"--out={tmp_path / 'out'}") == 1
+    assert f"{stamps}, line 6: time " in capsys.readouterr().err
+
+
 def test_kitti_is_looked_at_too(tmp_path, capsys):
     drive = writers.write_kitti(tmp_path)
     run(drive, f"--out={tmp_path / 'out'}")

@@ -19,7 +19,7 @@ from muvo_jax.model import live, rollout
 from muvo_jax.model.world_model import WorldModel
 from muvo_jax.types import OCCUPANCY_OCCUPIED, OCCUPANCY_UNKNOWN, Array, ArrayLike, LatentState, Variables
 
-HEADS = ("image", "range_view", "occupancy")
+HEADS = ("image", "range_view", "occupancy", "ego_motion")
 # Name -> two actions, each held for the whole horizon.
 CONTRASTS = {"brake or accelerate": ((-0.5, 0.0), (0.5, 0.0)), "left or right": ((0.0, -0.15), (0.0, 0.15))}
 
@@ -92,7 +92,7 @@ def score(head: str, predicted: Sequence[ArrayLike], shown: Sequence[ArrayLike])
 
     Args:
       head: one of HEADS; images answer in [0, 1], range views in metres of range where both plans return, occupancy in
-        probability where both plans know.
+        probability where both plans know, ego_motion in m/s of speed.
       predicted: decoded under either plan, [..., *size, channels].
       shown: types.Batch's field under either plan, [..., *size, channels] ([..., X, Y, Z] of occupancy).
     """
@@ -105,7 +105,7 @@ def score(head: str, predicted: Sequence[ArrayLike], shown: Sequence[ArrayLike])
 
 
 def _value(head: str, decoded: np.ndarray) -> np.ndarray:
-    if head == "range_view":
+    if head in ("range_view", "ego_motion"):
         return decoded[..., 3]
     if head == "occupancy":
         return np.asarray(jax.nn.sigmoid(decoded[..., 1] - decoded[..., 0]))
@@ -118,4 +118,6 @@ def _truth(head: str, shown: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         return shown[..., 3], shown[..., 3] > 0
     if head == "occupancy":
         return (shown == OCCUPANCY_OCCUPIED).astype(np.float32), shown != OCCUPANCY_UNKNOWN
+    if head == "ego_motion":
+        return shown[..., 3], np.ones(shown.shape[:-1], bool)
     return shown.astype(np.float32) / 255.0, np.ones(shown.shape, bool)

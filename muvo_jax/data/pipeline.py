@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import os
 import queue
 import threading
 import time
@@ -20,8 +21,8 @@ from muvo_jax.data import ego_motion, prepare, schema
 from muvo_jax.data import windows as windows_lib
 
 State = dict[str, Any]  # plain JSON types
-_READ_THREADS = 2
-_READ_AHEAD = 4  # batches
+_READ_AHEAD = 4  # batches, at least
+_FEWEST_WORKERS, _MOST_WORKERS = 2, 16
 _UNTIMED = ("intrinsics", "camera_to_ego")
 _HOST_ONLY = ("timestamp_s", "frame_id")
 _Item = TypeVar("_Item")
@@ -79,13 +80,14 @@ class TrainBatches:
     """
 
     def __init__(self, frames: Frames, *, seed: int, batch: int | None = None, start_state: State | None = None,
-                 process: int = 0, processes: int = 1):
+                 process: int = 0, processes: int = 1, accumulate: int = 1):
         """Opens the stream.
 
         Args:
           batch: windows per batch over all processes, by default config.train.batch.
           process, processes: which share of each batch is read here, such as jax.process_index() of
             jax.process_count(). The order of the windows, and so the saved position, is the same for any number.
+          accumulate: micro-batches in a batch; of each of them every process reads its share.
           start_state: from `get_state` of a stream with the same recording, seed and sizes.
 
         Raises:
@@ -95,16 +97,19 @@ class TrainBatches:
         windows = windows_lib.find_windows(frames.recording, "train", frames=data.frames, stride=data.stride)
         size = batch or frames.config.train.batch
         self.windows_per_epoch = len(windows)
-        if size % processes or not 0 <= process < processes:
-            raise schema.DataError(f"process {process} of {processes}: a batch of {size} windows needs a number of "
-                                   f"processes that divides it, and a process from 0 to that number - 1.")
-        share = slice(process * size // processes, (process + 1) * size // processes)
+        if size % (processes * accumulate) or not 0 <= process < processes:
+            raise schema.DataError(f"process {process} of {processes}: a batch of {size} windows in {accumulate} "
+                                   f"micro-batches needs a number of processes that divides each of them, and a "
+                                   f"process from 0 to that number - 1.")
+        share = np.arange(size).reshape(accumulate, processes, -1)[:, process].ravel()
         self._identity = {"seed": seed, "windows": len(windows), "batch": size, "frames": data.frames,
                           "stride": data.stride}
         # There is no remainder to drop; without the flag Grain's length of batches of one overflows.
         dataset = grain.MapDataset.source(windows).seed(seed).shuffle().repeat().batch(
-            size, drop_remainder=True, batch_fn=lambda chosen: frames.batch(chosen[share]))
-        options = grain.ReadOptions(num_threads=_READ_THREADS, prefetch_buffer_size=_READ_AHEAD)
+            size, drop_remainder=True, batch_fn=lambda chosen: frames.batch([chosen[index] for index in share]))
+        # Threads, not processes: decoding and NumPy let go of the interpreter, and all share one cache of frames.
+        threads = data.workers or default_workers()
+        options = grain.ReadOptions(num_threads=threads, prefetch_buffer_size=max(_READ_AHEAD, threads))
         self._iterator = iter(dataset.to_iter_dataset(options))
         if start_state is not None:
             if start_state.get("identity") != self._identity:
@@ -121,6 +126,12 @@ class TrainBatches:
     def get_state(self) -> State:
         """Where the stream stands; plain JSON types."""
         return {"identity": dict(self._identity), "position": self._iterator.get_state()}
+
+
+def default_workers() -> int:
+    """One for each processor this process may use but one, which is left to the training step; 2 to 16."""
+    usable = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    return min(max(usable - 1, _FEWEST_WORKERS), _MOST_WORKERS)
 
 
 def train_batches(frames: Frames, *, seed: int, batch: int | None = None,

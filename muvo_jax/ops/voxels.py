@@ -54,7 +54,7 @@ def voxel_table(points_m: np.ndarray, tags: np.ndarray, grid: config_lib.VoxelGr
     range_view.check_points(points_m)
     if np.shape(tags) != points_m.shape[:1]:
         raise ValueError(f"tags: got shape {np.shape(tags)}, expected one for each of {len(points_m)} points.")
-    number = np.empty(len(points_m), np.int32)
+    number = np.empty(len(points_m), np.intp)
     to_corner = np.empty(len(points_m))
     for start in range(0, len(points_m), range_view.BLOCK_POINTS):
         block = slice(start, start + range_view.BLOCK_POINTS)

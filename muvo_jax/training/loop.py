@@ -18,6 +18,7 @@ import jax
 from muvo_jax import config as config_lib
 from muvo_jax import types
 from muvo_jax.data import pipeline, prepare, schema
+from muvo_jax.objectives import perceptual
 from muvo_jax.training import checkpoint, checkpoint_meta, host, preparation, run_folder, screen, start, validation
 
 Preview = Callable[[pathlib.Path, validation.Validator, types.Variables, str], None]
@@ -38,6 +39,8 @@ class Job:
       chosen: dotted names that the user set, which fitting the config to the data leaves alone.
       resume: go on with the run in `folder` instead of starting one.
       init: a run whose newest readable weights a new run starts from.
+      pretrained: fills fresh variables with weights from elsewhere, and says which in sentences.
+      frozen: the network of the perceptual term, where that is on.
       resume_command: what to type to go on, for messages.
       started_s: time.perf_counter() at the start of the command.
       preview: draws pictures at `train.preview_every`.
@@ -49,6 +52,8 @@ class Job:
     chosen: Collection[str] = ()
     resume: bool = False
     init: pathlib.Path | None = None
+    pretrained: start.Pretrained | None = None
+    frozen: perceptual.FrozenEncoder | None = None
     resume_command: str = "python -m muvo_jax.train --resume"
     started_s: float = dataclasses.field(default_factory=time.perf_counter)
     preview: Preview | None = None
@@ -77,16 +82,17 @@ def train(job: Job, show: screen.Screen) -> Outcome:
     else:
         run_folder.check_new(job.folder, job.resume_command)
     with concurrent.futures.ThreadPoolExecutor(1, "preparation") as background:
-        early = background.submit(_prepare_early, job.config)
+        early = background.submit(_prepare_early, job.config, job.frozen)
         config, recording, making_s = _open_data(job, show)
         frames = pipeline.Frames(recording, config)
         source = pipeline.train_batches(frames, seed=config.train.seed, batch=windows_per_step(config))
         shapes = preparation.expected_batch(config, windows_per_step(config),
                                             rewards="reward" in recording.description.modalities)
         ready = early.result()
-        ready = preparation.recompile(ready, config, shapes) if ready else preparation.prepare(config, shapes)
+        ready = (preparation.recompile(ready, config, shapes, job.frozen) if ready
+                 else preparation.prepare(config, shapes, job.frozen))
     _introduce(job, show, config, ready, source.windows_per_epoch)
-    first = functools.partial(start.first, job.init, show, config, ready, frames)
+    first = functools.partial(start.first, job.init, job.pretrained, show, config, ready, frames)
     state, done, data_state = (None if job.resume else first()), 0, None
     if not job.resume:
         run_folder.create(job.folder, config, job.resume_command)
@@ -98,7 +104,7 @@ def train(job: Job, show: screen.Screen) -> Outcome:
                                         start_state=data_state)
     run_folder.write_config(job.folder, config)
     files = run_folder.RunFolder(job.folder, done)
-    validator = validation.Validator(ready.model, config, frames)
+    validator = validation.Validator(ready.model, config, frames, job.frozen)
     try:
         run = _Run(job, show, config, ready, keeper, files, validator, state, done, provenance(recording, config))
         return run.loop(source, making_s)
@@ -122,11 +128,12 @@ def provenance(recording: schema.Recording, config: config_lib.Config) -> dict:
             "rate_hz": description.rate_hz, "notes": list(description.notes)}
 
 
-def _prepare_early(config: config_lib.Config) -> preparation.Prepared | None:
+def _prepare_early(config: config_lib.Config,
+                   frozen: perceptual.FrozenEncoder | None) -> preparation.Prepared | None:
     """Compiles while the town is recorded: its sensors are the preset's. Other data must be looked at first."""
     if config.data.path != "town":
         return None
-    return preparation.prepare(config, preparation.expected_batch(config, windows_per_step(config)))
+    return preparation.prepare(config, preparation.expected_batch(config, windows_per_step(config)), frozen)
 
 
 def _open_data(job: Job, show: screen.Screen) -> tuple[config_lib.Config, schema.Recording, float]:
@@ -153,6 +160,8 @@ def _introduce(job: Job, show: screen.Screen, config: config_lib.Config, ready: 
                         f"{', '.join(config.model.heads)}")
     extra = f" x {accumulate} accumulated" if accumulate > 1 else ""
     show.field("steps", f"{config.train.steps} of {config.train.batch} windows{extra}, {ready.step.plan.describe()}")
+    if job.frozen is not None:
+        show.field("perceptual", f"pictures are compared by {job.frozen.source}, frozen")
     show.field("run", str(job.folder))
 
 

@@ -5,11 +5,15 @@ device axis and a checkpoint does not know how many devices wrote it. The body i
 `AXIS` before every ratio and averages gradients with `pmean`. That is right for pmap, and for shard_map with
 check_vma=False, where the transpose of a sum over devices is again a sum; with check_vma=True the same code would scale
 the gradients wrongly (Adam hides such a factor, so the tests compare raw gradients).
+
+Several processes (jax.distributed) share a step through shard_map: each places the windows that it read itself, and
+all of them call the step together.
 """
 
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -37,6 +41,11 @@ class Plan:
     devices: tuple[jax.Device, ...]
 
     @property
+    def processes(self) -> int:
+        """How many processes own these devices."""
+        return len({device.process_index for device in self.devices})
+
+    @property
     def mesh(self) -> Mesh:
         return Mesh(np.asarray(self.devices), (AXIS,), axis_types=(AxisType.Auto,))
 
@@ -51,26 +60,47 @@ def make_plan(parallel: str, batch_size: int, devices: Sequence[jax.Device] | No
     """Chooses devices for micro-batches of `batch_size` windows.
 
     "auto" takes shard_map over as many devices as divide the batch, and no wrapper where that is one. "pmap" and
-    "shard_map" take all devices.
+    "shard_map" take all devices, and so does "auto" where they belong to several processes.
 
     Raises:
-      ValueError: for an unknown mode, or where an explicit mode cannot split the batch evenly.
+      ValueError: for an unknown mode, or where all devices have to share the batch and cannot split it evenly; for pmap
+        with several processes.
     """
     devices = tuple(jax.devices() if devices is None else devices)
     if parallel not in MODES:
         raise ValueError(f"parallel: got {parallel!r}, expected one of {', '.join(MODES)}.")
+    if len({device.process_index for device in devices}) > 1:
+        if parallel == "pmap":
+            raise ValueError("parallel=pmap works within one process; use parallel=shard_map (or auto) with several.")
+        parallel = "shard_map"
     if parallel == "auto":
         count = max(n for n in range(1, len(devices) + 1) if batch_size % n == 0)
         return Plan("single" if count == 1 else "shard_map", devices[:count])
     if batch_size % len(devices):
         raise ValueError(f"parallel={parallel}: {batch_size} windows cannot be split over {len(devices)} devices. "
-                         f"Set train.batch to a multiple of {len(devices)}, or use parallel=auto.")
+                         f"Set train.batch to a multiple of {len(devices)}, or, within one process, use "
+                         f"parallel=auto.")
     return Plan(parallel, devices)
 
 
 def place_state(plan: Plan, state: Any) -> Any:
-    """A copy of the state on every device of the plan (the same arrays where they are there already)."""
-    return jax.device_put(state, NamedSharding(plan.mesh, PartitionSpec()))
+    """A copy of the state on every device of the plan (the same arrays where they are there already).
+
+    Several processes must all pass the same numbers.
+    """
+    sharding = NamedSharding(plan.mesh, PartitionSpec())
+    if plan.processes == 1:
+        return jax.device_put(state, sharding)
+    return jax.tree.map(functools.partial(_on_all_processes, sharding), state)
+
+
+def _on_all_processes(sharding: NamedSharding, leaf: types.ArrayLike) -> jax.Array:
+    if isinstance(leaf, jax.Array) and not leaf.is_fully_addressable:  # it is there
+        return leaf
+    if jax.dtypes.issubdtype(leaf.dtype, jax.dtypes.prng_key):
+        data = _on_all_processes(sharding, jax.random.key_data(leaf))
+        return jax.random.wrap_key_data(data, impl=jax.random.key_impl(leaf))
+    return jax.make_array_from_process_local_data(sharding, np.asarray(leaf))
 
 
 def place_batch(plan: Plan, batch: types.Batch, accumulate: int) -> types.Batch:
@@ -78,7 +108,8 @@ def place_batch(plan: Plan, batch: types.Batch, accumulate: int) -> types.Batch:
 
     Args:
       plan: where to.
-      batch: leaves [accumulate * B, ...]; windows m * B to (m + 1) * B - 1 are micro-batch m.
+      batch: leaves [accumulate * B, ...]; windows m * B to (m + 1) * B - 1 are micro-batch m. With several processes
+        the part of each micro-batch that this process read (data.pipeline.TrainBatches), B / processes windows.
       accumulate: how many micro-batches.
 
     Returns:
@@ -87,13 +118,16 @@ def place_batch(plan: Plan, batch: types.Batch, accumulate: int) -> types.Batch:
     Raises:
       ValueError: where the windows cannot be split evenly.
     """
-    windows, devices = batch.batch_size, len(plan.devices)
+    windows, devices = batch.batch_size, len(plan.devices) // plan.processes
     if windows % (accumulate * devices):
         raise ValueError(f"a batch of {windows} windows cannot be split into {accumulate} micro-batches over {devices} "
                          f"devices; expected a multiple of {accumulate * devices}.")
     leading = (accumulate, devices, -1) if plan.mode == "pmap" else (accumulate, windows // accumulate)
     split = jax.tree.map(lambda leaf: leaf.reshape(*leading, *leaf.shape[1:]), batch)
-    return jax.device_put(split, NamedSharding(plan.mesh, PartitionSpec(None, AXIS)))
+    sharding = NamedSharding(plan.mesh, PartitionSpec(None, AXIS))
+    if plan.processes == 1:
+        return jax.device_put(split, sharding)
+    return jax.tree.map(lambda leaf: jax.make_array_from_process_local_data(sharding, np.asarray(leaf)), split)
 
 
 def spread(plan: Plan, body: Body, *, donate_state: bool = False) -> Callable[[Any, types.Batch], Any]:

@@ -15,6 +15,7 @@ import numpy as np
 from muvo_jax import config as config_lib
 from muvo_jax import types
 from muvo_jax.model import world_model
+from muvo_jax.objectives import perceptual
 from muvo_jax.training import optimizer as optimizer_lib
 from muvo_jax.training import parallel as parallel_lib
 from muvo_jax.training import state as state_lib
@@ -84,19 +85,21 @@ def shapes_of(batch: types.Batch) -> types.Batch:
     return jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype), batch)
 
 
-def prepare(config: config_lib.Config, batch_shapes: types.Batch) -> Prepared:
+def prepare(config: config_lib.Config, batch_shapes: types.Batch,
+            frozen: perceptual.FrozenEncoder | None = None) -> Prepared:
     """Initialises the model and compiles its training step.
 
     Args:
       config: of the run.
       batch_shapes: [train.batch * optimizer.accumulate, frames, ...].
+      frozen: the network of the perceptual term, where that is on.
 
     Raises:
       ValueError: where the batch cannot be split over the devices.
     """
     start_s = time.perf_counter()
     model = world_model.WorldModel(config.model)
-    step = step_lib.make_train_step(model, config)
+    step = step_lib.make_train_step(model, config, frozen=frozen)
     run_key = jax.random.key(config.train.seed)
     example = jax.tree.map(lambda leaf: np.zeros((1, *leaf.shape[1:]), leaf.dtype), batch_shapes)
     variables = model.init(jax.random.fold_in(run_key, 0), example)
@@ -111,7 +114,8 @@ def prepare(config: config_lib.Config, batch_shapes: types.Batch) -> Prepared:
                     initialised_s - start_s, time.perf_counter() - initialised_s)
 
 
-def recompile(prepared: Prepared, config: config_lib.Config, batch_shapes: types.Batch) -> Prepared:
+def recompile(prepared: Prepared, config: config_lib.Config, batch_shapes: types.Batch,
+              frozen: perceptual.FrozenEncoder | None = None) -> Prepared:
     """`prepared` where it already fits, else a new one for what the data turned out to be."""
     same = prepared.model.config == config.model and prepared.batch_shapes == batch_shapes
-    return prepared if same else prepare(config, batch_shapes)
+    return prepared if same else prepare(config, batch_shapes, frozen)

@@ -9,6 +9,7 @@ from typing import Any
 import jax
 
 from muvo_jax import config as config_lib
+from muvo_jax import types
 from muvo_jax.data import pipeline
 from muvo_jax.training import (
     checkpoint,
@@ -22,20 +23,28 @@ from muvo_jax.training import (
 )
 from muvo_jax.training import state as state_lib
 
+Pretrained = Callable[[types.Variables, config_lib.ModelConfig], tuple[types.Variables, tuple[str, ...]]]
 
-def first(init: pathlib.Path | None, show: screen.Screen, config: config_lib.Config, ready: preparation.Prepared,
-          frames: pipeline.Frames) -> state_lib.TrainState:
-    """The state of step 0: weights of the run `init`, or fresh ones.
+
+def first(init: pathlib.Path | None, pretrained: Pretrained | None, show: screen.Screen, config: config_lib.Config,
+          ready: preparation.Prepared, frames: pipeline.Frames) -> state_lib.TrainState:
+    """The state of step 0: weights of the run `init`, or fresh ones, some of which `pretrained` replaces.
 
     Raises:
       CheckpointError: where `init` has no checkpoint that can be read.
-      ValueError: where its weights belong to another network.
+      ValueError: where its weights, or those of `pretrained`, belong to another network.
     """
     if init:
         return _from_run(init, show, config, ready)
+    state = ready.state
+    if pretrained is not None:
+        variables, notes = pretrained(state.variables, config.model)
+        for note in notes:
+            show.field("loaded", note)
+        state = ready.with_variables(variables, config)
     if config.model.first_guess == "training_mean":
-        return first_guess.fill(ready.state, validation.training_sums(frames), config.model, ready.step.plan)
-    return ready.state
+        return first_guess.fill(state, validation.training_sums(frames), config.model, ready.step.plan)
+    return state
 
 
 def resume(keeper: checkpoint.Checkpoints, show: screen.Screen, config: config_lib.Config, ready: preparation.Prepared,

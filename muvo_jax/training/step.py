@@ -20,7 +20,7 @@ from muvo_jax import config as config_lib
 from muvo_jax import types
 from muvo_jax.metrics import image as image_metrics
 from muvo_jax.model import rollout, world_model
-from muvo_jax.objectives import total
+from muvo_jax.objectives import perceptual, total
 from muvo_jax.training import augmentation
 from muvo_jax.training import optimizer as optimizer_lib
 from muvo_jax.training import parallel as parallel_lib
@@ -56,7 +56,8 @@ class SpreadFunction:
 
 
 def make_train_step(model: world_model.WorldModel, config: config_lib.Config, *, parallel: str | None = None,
-                    devices: Sequence[jax.Device] | None = None) -> SpreadFunction:
+                    devices: Sequence[jax.Device] | None = None,
+                    frozen: perceptual.FrozenEncoder | None = None) -> SpreadFunction:
     """Builds function(state, batch) -> (state, metrics); the state that goes in is donated.
 
     The metrics are float32 scalars: every loss term (unweighted), "total", "psnr_db" of the observed images,
@@ -68,10 +69,11 @@ def make_train_step(model: world_model.WorldModel, config: config_lib.Config, *,
       config: losses, optimiser, batch and accumulation.
       parallel: "auto", "pmap" or "shard_map"; by default config.train.parallel.
       devices: by default all.
+      frozen: the network of the perceptual term, where that is on.
     """
     optimizer = optimizer_lib.make_optimizer(config.optimizer, config.train.steps)
     rate = optimizer_lib.learning_rate(config.optimizer, config.train.steps)
-    gradients_of = gradient_body(model, config)
+    gradients_of = gradient_body(model, config, frozen)
 
     def body(state, batch, axis_name):
         gradients, batch_stats, metrics = gradients_of(state, batch, axis_name)
@@ -93,35 +95,37 @@ def make_train_step(model: world_model.WorldModel, config: config_lib.Config, *,
 
 
 def make_validation_step(model: world_model.WorldModel, config: config_lib.Config, *, batch_size: int | None = None,
-                         parallel: str | None = None,
-                         devices: Sequence[jax.Device] | None = None) -> SpreadFunction:
+                         parallel: str | None = None, devices: Sequence[jax.Device] | None = None,
+                         frozen: perceptual.FrozenEncoder | None = None) -> SpreadFunction:
     """Builds function(state, batch) -> metrics: the loss terms and "psnr_db" without dropout, on running statistics.
 
     The latents are sampled with keys that depend on the run's key and the place in the batch, not on the step, so that
     the numbers of two steps compare.
 
     Args:
-      model, config, parallel, devices: as `make_train_step`.
+      model, config, parallel, devices, frozen: as `make_train_step`.
       batch_size: windows per call; by default config.train.batch.
     """
     def body(state, batch, axis_name):
         windows = batch[0]  # a single micro-batch
         keys = sample_keys(state.key, _VALIDATION_STEP, 0, windows.batch_size, axis_name)
         _, (metrics, _) = forward(state.params, state.batch_stats, windows, keys, model=model, config=config,
-                                  train=False, axis_name=axis_name)
+                                  train=False, axis_name=axis_name, frozen=frozen)
         return metrics
 
     plan = parallel_lib.make_plan(parallel or config.train.parallel, batch_size or config.train.batch, devices)
     return SpreadFunction(plan, 1, parallel_lib.spread(plan, body))
 
 
-def gradient_body(model: world_model.WorldModel, config: config_lib.Config) -> Callable:
+def gradient_body(model: world_model.WorldModel, config: config_lib.Config,
+                  frozen: perceptual.FrozenEncoder | None = None) -> Callable:
     """Returns body(state, batch [accumulate, b, ...], axis_name) -> (gradients, batch_stats, metrics).
 
     Gradients and metrics are means over micro-batches, equal on all devices; running statistics pass through the
     micro-batches in order.
     """
-    differentiate = jax.value_and_grad(functools.partial(forward, model=model, config=config, train=True), has_aux=True)
+    scored = functools.partial(forward, model=model, config=config, train=True, frozen=frozen)
+    differentiate = jax.value_and_grad(scored, has_aux=True)
 
     def micro_step(state, batch_stats, batch, index, axis_name):
         keys = sample_keys(state.key, state.step, index, batch.batch_size, axis_name)
@@ -164,7 +168,8 @@ def sample_keys(run_key: types.Array, step: int | types.Array, micro_batch: int 
 
 
 def forward(params: Any, batch_stats: Any, batch: types.Batch, keys: types.Array, *, model: world_model.WorldModel,
-            config: config_lib.Config, train: bool, axis_name: str | None) -> tuple[types.Array, tuple[Metrics, Any]]:
+            config: config_lib.Config, train: bool, axis_name: str | None,
+            frozen: perceptual.FrozenEncoder | None = None) -> tuple[types.Array, tuple[Metrics, Any]]:
     """Observes a window, decodes its frames (in training those that the config asks for) and scores them.
 
     Args:
@@ -174,6 +179,7 @@ def forward(params: Any, batch_stats: Any, batch: types.Batch, keys: types.Array
       model, config: what to compute.
       train: augmentation, dropout, prior dropout and batch moments; otherwise none of them and running moments.
       axis_name: mesh axis the batch is spread over, or None.
+      frozen: the network of the perceptual term, where that is on.
 
     Returns:
       The total loss of the whole batch, and (metrics, new batch_stats).
@@ -195,7 +201,7 @@ def forward(params: Any, batch_stats: Any, batch: types.Batch, keys: types.Array
         decode = functools.partial(model.decode, heads=(head,))
         predictions |= maybe_remat(decode)(variables, features)
     terms = total.losses(predictions, batch, observed, model=model.config, loss=config.loss, keys=keys,
-                         axis_name=axis_name)
+                         axis_name=axis_name, frozen=frozen)
     metrics = dict(terms)
     if batch.image is not None and "image" in predictions:
         metrics["psnr_db"] = _mean(image_metrics.frame_psnr_db(predictions["image"][1], batch.image), axis_name)

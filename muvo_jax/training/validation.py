@@ -13,6 +13,7 @@ from muvo_jax import types
 from muvo_jax.data import pipeline, prepare, schema, sources
 from muvo_jax.metrics import baselines, protocol
 from muvo_jax.model import world_model
+from muvo_jax.objectives import perceptual
 from muvo_jax.training import checkpoint
 from muvo_jax.training import state as state_lib
 from muvo_jax.training import step as step_lib
@@ -23,12 +24,13 @@ TRAINING_MEAN_FRAMES = 512
 class Validator:
     """Validates on the first device; its functions are compiled once and shared with the final evaluation."""
 
-    def __init__(self, model: world_model.WorldModel, config: config_lib.Config, frames: pipeline.Frames):
+    def __init__(self, model: world_model.WorldModel, config: config_lib.Config, frames: pipeline.Frames,
+                 frozen: perceptual.FrozenEncoder | None = None):
         self.model, self.config, self.frames = model, config, frames
         self.splits = tuple(split for split in frames.recording.description.splits if split != "train")
         self._device = jax.devices()[0]
         self._losses = step_lib.make_validation_step(model, config, batch_size=config.evaluation.batch,
-                                                     devices=[self._device])
+                                                     devices=[self._device], frozen=frozen)
 
     def run(self, state: state_lib.TrainState, split: str) -> dict[str, float]:
         """Loss terms and observed PSNR over whole windows, and the scores of imagined frames (NaN where undefined)."""

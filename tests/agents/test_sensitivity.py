@@ -22,6 +22,9 @@ def test_the_response_of_each_head_by_hand():
     halved = [np.stack([np.zeros(3)] * 3 + [0.5 * row * [1, 1, 30]], axis=-1) for row in ranges]
     assert sensitivity.score("range_view", halved, views)["gain"] == pytest.approx(0.5)
 
+    speeds = [np.array([[0.0, 0.0, 0.0, speed]]) for speed in (2.0, 6.0)]
+    assert sensitivity.score("ego_motion", [speeds[0], 0.75 * speeds[1]], speeds)["gain"] == pytest.approx(0.625)
+
     voxels = [np.array([0, 1, 255], np.uint8), np.array([1, 1, 0], np.uint8)]
     sure = [np.array([[40.0, 0.0], [0.0, 40.0], [0.0, 0.0]]), np.array([[0.0, 0.0], [0.0, 40.0], [40.0, 0.0]])]
     assert sensitivity.score("occupancy", sure, voxels)["gain"] == pytest.approx(0.5)  # 0 -> 1/2, of 0 -> 1

@@ -121,6 +121,12 @@ def test_processes_share_each_batch_and_any_number_of_them_resumes():
         pipeline.TrainBatches(frames_of(), seed=0, process=0, processes=3)
 
 
+def test_the_number_of_workers_changes_nothing():
+    streams = [pipeline.train_batches(frames_of(workers=workers), seed=0) for workers in (1, 5)]
+    first, second = (speeds(take(stream, 6)) for stream in streams)
+    assert first == second and 2 <= pipeline.default_workers() <= 16
+
+
 def test_the_seed_decides_the_order():
     orders = [speeds(take(pipeline.train_batches(frames_of(), seed=seed), 6)) for seed in (0, 0, 1)]
     assert orders[0] == orders[1] != orders[2]

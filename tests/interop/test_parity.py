@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from muvo_jax.interop import packs, reference_data, weights_rule
-from muvo_jax.interop.parity import cases, geometry, losses, modules_1d, pooling, registry, runner
+from muvo_jax.interop.parity import cases, geometry, losses, modules_1d, modules_2d, pooling, registry, runner
 
 SILENT = lambda line: None
 # Only the losses that the made-up packs hold: the others would be computed for nothing.
@@ -162,9 +162,26 @@ def test_modules_of_the_1d_model():
     assert checked("p3_1d", "p3_modules_1d.npz", groups).passed == 30
 
 
+def test_modules_of_the_2d_model():
+    assert checked("p3_2d", "p3_modules_2d.npz", (modules_2d.recurrent_units, modules_2d.backbone)).passed == 5
+
+
+def test_a_kink_is_compared_on_both_of_its_sides(tmp_path):
+    """relu'(0) is 0 or 1, as rounding has it; 0.5 is neither."""
+    np.savez(tmp_path / "p.npz", slope=np.float32(1.0), level=np.float32(0.5))
+    sides = lambda: iter([np.float32(0.0), np.float32(1.0)])
+    group = lambda context: (cases.Check(entry, np.float32(0.0), 1e-3, again=sides) for entry in ("slope", "level"))
+    report, lines = runner.Report(), []
+    runner.run_pack(cases.PackChecks("p", ("p",), (group,)),
+                    cases.Context(packs.Pack(tmp_path / "p.npz"), packs.Settings()), report, lines.append)
+    assert (report.passed, report.failed) == (1, 1)
+    assert "1.0e+00 as first rounded, this in try 2" in lines[0] and "FAIL" in lines[1]
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize("name, file, entries", [("p3_1d", "p3_modules_1d.npz", 61),
-                                                 ("p3_2d", "p3_modules_2d.npz", 82)])
+@pytest.mark.parametrize("name, file, entries", [
+    ("p1", "p1_losses_metrics.npz", 142), ("p3_1d", "p3_modules_1d.npz", 61), ("p3_2d", "p3_modules_2d.npz", 82),
+    ("p5_losses", "p5_losses_all_1d.npz", 42), ("p5_losses", "p5_losses_all_2d.npz", 39)])
 def test_whole_packs(name, file, entries):
     checks = next(checks for checks in registry.PACKS if checks.name == name)
     assert checked(name, file, checks.groups).passed == entries

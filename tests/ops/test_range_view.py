@@ -106,7 +106,7 @@ def test_agrees_with_the_reference():
 
 
 def test_many_points_in_one_pixel():
-    """More than the rounds of scattering: the rest is sorted. From near to far is the worst order."""
+    """Whatever their order."""
     for steps in (np.arange(1, 101), np.arange(100, 0, -1)):
         points_m = LIDAR_M + np.stack([steps, 0 * steps, 0 * steps], axis=1).astype(np.float32)
         nearest = range_view.nearest_points(points_m, GEOMETRY)

@@ -17,12 +17,12 @@ CONFIG = config_lib.OptimizerConfig()
 
 @pytest.mark.parametrize("total_steps", [50_000, 100_000])
 def test_schedules_match_torch(total_steps):
-    golden = golden_rule.Golden("onecycle.npz")
-    steps = jnp.asarray(golden[f"{total_steps}_step"].astype(np.int32))
+    golden = golden_rule.Golden("p5_schedules.npz")
+    steps = jnp.asarray(golden[f"onecycle_{total_steps}/step"].astype(np.int32))
     rates = jax.vmap(optimizer_lib.learning_rate(CONFIG, total_steps))(steps)
     momenta = jax.vmap(optimizer_lib.beta1(CONFIG, total_steps))(steps)
-    np.testing.assert_allclose(rates, golden[f"{total_steps}_lr"], rtol=1e-6)
-    np.testing.assert_allclose(momenta, golden[f"{total_steps}_beta1"], rtol=1e-6)
+    np.testing.assert_allclose(rates, golden[f"onecycle_{total_steps}/lr"], rtol=1e-6)
+    np.testing.assert_allclose(momenta, golden[f"onecycle_{total_steps}/beta1"], rtol=1e-6)
 
 
 def test_schedule_by_arithmetic():

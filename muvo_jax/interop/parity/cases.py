@@ -21,9 +21,9 @@ class Check:
       tolerance: the largest error that passes.
       measure: (pack, entry, got) -> error; by default that of packs.Pack.error.
       stands_alone: whether the expected value lies elsewhere than in the pack (in `measure`).
-      again: where the function has kinks, the same value on weights that differ by rounding (drawing.rounded_anew): at
-        a kink it is chance on which side float32 comes out, in the reference too, so one of these may be its value.
-        They are asked for only where `got` misses the tolerance.
+      again: the same value on weights that differ by rounding (drawing.rounded_anew), asked for only where `got` misses
+        the tolerance. At a kink of the function it is chance on which side float32 comes out, in the reference too, so
+        one of these may be its value. Of a smooth one this gives the mean, from which our own rounding is gone.
     """
 
     entry: str

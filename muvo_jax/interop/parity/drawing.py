@@ -47,11 +47,14 @@ def draw_variables(shapes: Any, prefix: str = "", where: str = "",
     return jax.tree_util.tree_map_with_path(draw, shapes)
 
 
-def rounded_anew(variables: Any, tries: int = 32) -> Iterator[Any]:
-    """The variables as rounding could have left them: times 1 + 1e-7 N(0, 1), as the packs' noise was measured."""
+def rounded_anew(variables: Any, tries: int = 32, size: float = 1e-7) -> Iterator[Any]:
+    """The variables as rounding could have left them: times 1 + size N(0, 1).
+
+    The noise of the packs was measured with 1e-7; what a deep network makes of its own rounding is about 1e-6.
+    """
     for seed in range(tries):
         random = np.random.default_rng(seed)
-        noise = jax.tree.map(lambda leaf, random=random: 1e-7 * random.standard_normal(leaf.shape), variables)
+        noise = jax.tree.map(lambda leaf, random=random: size * random.standard_normal(leaf.shape), variables)
         yield jax.tree.map(lambda leaf, part: np.asarray(leaf * (1.0 + part), np.float32), variables, noise)
 
 

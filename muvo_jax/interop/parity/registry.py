@@ -26,6 +26,7 @@ PACKS = (
     cases.PackChecks("p4", _FULL_MODELS, full_models.GROUPS),
     cases.PackChecks("p4_backbone", (r"mobilevitv2_100_backbone\.npz",), full_models.BACKBONE_GROUPS),
     cases.PackChecks("p5_losses", (r"p5_losses_all_[12]d\.npz",), all_losses.GROUPS),
+    cases.PackChecks("p5_schedules", (r"p5_schedules\.npz",), (train_step.schedules,)),
     cases.PackChecks("p5_step", (r"p5_train_step_[12]d\.npz",), train_step.GROUPS),
     cases.PackChecks("p6", (r"p6_\w+\.npz",), p6.GROUPS, needs_recordings=True),
 )

@@ -113,7 +113,7 @@ def _record(check: cases.Check, pack: packs.Pack, label: str, report: Report, wr
             for tries, value in enumerate(check.again(), start=1):
                 error = min(error, check.measure(pack, check.entry, value))
                 if error <= check.tolerance:
-                    note = f"  ({computed:.1e} on this side of a kink, crossed in try {tries})"
+                    note = f"  ({computed:.1e} as first rounded, this in try {tries})"
                     break
     passed = error <= check.tolerance
     report.passed += passed

@@ -27,7 +27,7 @@ from muvo_jax.training import optimizer as optimizer_lib
 Checks = Iterator[cases.Check]
 LOSS_TOLERANCE, STATISTICS_TOLERANCE, NORM_TOLERANCE, NEW_TOLERANCE = 1e-4, 1e-5, 5e-3, 1e-5
 STYLED_TOLERANCE, SCHEDULE_TOLERANCE = 5e-4, 1e-6
-_RATE = 1e-4
+_RATE, _CLEAR_SHARE = 1e-4, 1e-3
 _NOISY = ("encoder.", "range_view_encoder.", "feat_decoder.")
 _TERMS = {"image": "rgb", "range_xyz": "lidar_re", "range_depth": "lidar_depth", "occupancy_cross_entropy": "voxel",
           "occupancy_semantic_scal": "sem_scal", "occupancy_geometric_scal": "geo_scal", "kl": "probabilistic"}
@@ -164,20 +164,20 @@ def _update(context: cases.Context, params: Any, gradients: Any) -> Checks:
 
 
 def _step_error(pack: packs.Pack, entry: str, got: np.ndarray) -> float:
-    """The error where the sign of the gradient is known; infinite where a parameter moved further than it can.
+    """The error where the gradient is more than noise; infinite where a parameter moved further than it can.
 
     The first step of Adam is as long as the learning rate whatever the size of the gradient, so where that is noise
-    the step may go either way. It is noise below a thousandth of the largest one (the page of the pack), and below the
-    tolerance of the gradient itself.
+    the step may go either way: below a thousandth of the largest gradient, as the page of the pack says. The length of
+    the step is compared where the gradient is also above its own tolerance.
     """
-    key = entry.partition("/")[2]
+    kind, _, key = entry.partition("/")
     want, have = (value.astype(np.float64) for value in pack.stored(entry, got))
     size = np.abs(pack.stored(f"grad/{key}", got)[0])
-    clear = size > max(1e-3, gradient_tolerance(key)) * size.max()
+    least = _CLEAR_SHARE if kind == "new" else max(_CLEAR_SHARE, gradient_tolerance(key))
     apart = np.abs(want - have)
     if (apart > 2.01 * _RATE).any():
         return math.inf
-    return float(apart[clear].max(initial=0.0) / max(np.abs(want).max(), 1e-6))
+    return float(apart[size > least * size.max()].max(initial=0.0) / max(np.abs(want).max(), 1e-6))
 
 
 def _groups(latent: str) -> Checks:

@@ -113,7 +113,14 @@ def frozen_encoder(backbone: Backbone) -> perceptual.FrozenEncoder:
 
 def frozen_encoder_of_run(variables: Mapping[str, Any], config: config_lib.ModelConfig,
                           source: str) -> perceptual.FrozenEncoder:
-    """The image encoder of one of our models, frozen, as the network of the perceptual loss."""
+    """The image encoder of one of our models, frozen, as the network of the perceptual loss.
+
+    Raises:
+      BackboneError: where the model has no camera.
+    """
+    if "camera" not in variables["params"]:
+        raise BackboneError(f"{source}: its model has no camera, so no image encoder to compare pictures by. Take a "
+                            f"run with a camera, or a file of ImageNet weights.")
     network = _NETWORKS[config.backbone](config.backbone_width, _LEVELS)
     part = {name: jax.tree.map(np.asarray, dict(variables[name]["camera"]["backbone"]))
             for name in ("params", "batch_stats")}

@@ -139,7 +139,7 @@ def _sensor_encoders(known: Fields, state_dict: Mapping[str, np.ndarray], shape:
     if known["lidar"] == "pp":
         fields["pillars"] = config_lib.PillarGrid(channels=shape("point_pillars.point_net.net.0.weight")[0])
     if known["camera"] == "bev":
-        grid = dataclasses.replace(_birds_eye_grid(state_dict["frustum_pooling.bev_intrinsics"]),
+        grid = dataclasses.replace(_birds_eye_grid(state_dict.get("frustum_pooling.bev_intrinsics", np.zeros((3, 3)))),
                                    depth_bins=shape("depth.weight")[0])
         if "bev_down_sample_4.0.weight" in state_dict:
             grid = dataclasses.replace(grid, hidden_channels=shape("bev_down_sample_4.0.weight")[0])
@@ -186,13 +186,16 @@ def _vector_latent(known: Fields, state_dict: Mapping[str, np.ndarray], shape: S
             fields |= ({"image_size": (rows, columns)} if head == "image" else
                        {"range_view": config_lib.RangeViewGeometry(rows=rows, columns=columns)})
     if "birds_eye" in heads:
-        fields["decoder_channels"] = shape("bev_decoder.constant_tensor")[0]
+        constant = shape("bev_decoder.constant_tensor")
+        blocks = _count(state_dict, r"^bev_decoder\.middle_conv\.(\d+)\.")
+        fields |= {"decoder_channels": constant[0], "occupancy_blocks": blocks}
+        rows, columns = (side * 2 ** (blocks + 3) for side in constant[1:])
+        fields["voxels"] = config_lib.VoxelGrid((rows, columns, config_lib.VoxelGrid().shape[2]))
     if "occupancy" in heads:
+        constant = shape("voxel_decoder.constant_tensor")
         blocks = _count(state_dict, r"^voxel_decoder\.middle_conv\.(\d+)\.")
-        fields["occupancy_blocks"] = blocks
-        fields["occupancy_channels"] = shape("voxel_decoder.constant_tensor")[0] // 2
-        fields["voxels"] = config_lib.VoxelGrid(
-            tuple(side * 2 ** (blocks + 3) for side in shape("voxel_decoder.constant_tensor")[1:]))
+        fields |= {"occupancy_channels": constant[0] // 2, "occupancy_blocks": blocks}
+        fields["voxels"] = config_lib.VoxelGrid(tuple(side * 2 ** (blocks + 3) for side in constant[1:]))
     return fields
 
 

@@ -129,6 +129,8 @@ _POINTWISE = {
     r"^voxel_decoder\..*_head\.0\.weight$": 3,
     r"_head\.0\.weight$": 2,
     r"^rssm\.recurrent_model\.(w|conv_\w(_glo)?)\.weight$": 1,
+    r"^depth\.weight$": 2,
+    r"encoder\.stages_.*(conv[13]_1x1\.conv|conv_1x1|conv_proj\.conv|(qkv|out)_proj|mlp\.fc\d)\.weight$": 2,
 }
 
 
@@ -180,6 +182,17 @@ def to_reference_layout(path: str, value: np.ndarray) -> np.ndarray:
 def reference_shape(path: str, shape: tuple[int, ...]) -> tuple[int, ...]:
     """The shape that `to_reference_layout` gives to a variable of this shape."""
     return to_reference_layout(path, np.broadcast_to(np.float32(0), shape)).shape
+
+
+def reference_shapes(model_config: ModelConfig) -> dict[str, tuple[int, ...]]:
+    """Reference key -> shape in a checkpoint, for everything that a model of this configuration has."""
+    shapes = {}
+    for path, shape in _variables(model_config):
+        key = reference_key(path)
+        if key in shapes:
+            raise ValueError(f"two variables of the model have the name {key}")
+        shapes[key] = _full_shape(key, path, reference_shape(path, shape), model_config)
+    return shapes
 
 
 @dataclasses.dataclass(frozen=True)

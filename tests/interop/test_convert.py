@@ -39,10 +39,13 @@ def checkpoint_of(state_dict):
             "hyper_parameters": torch_writer.ForeignObject("fvcore.common.config", "CfgNode", {"STEPS": 5})}
 
 
-@pytest.fixture(scope="module", params=["1d", "2d"])
+@pytest.fixture(scope="module", params=[
+    {}, {"latent": "2d", "backbone": "mobilevitv2_100"},
+    {"lidar": "pp", "camera": "bev", "fusion": "fc", "navigation": True,
+     "heads": ("image", "range_view", "action", "birds_eye")}], ids=["1d", "2d-mobilevit", "fc"])
 def tiny(request):
     """Configuration, variables and state_dict of a small model."""
-    config = dataclasses.replace(TINY, latent=request.param)
+    config = dataclasses.replace(TINY, **request.param)
     variables = drawn_variables(config)
     return config, variables, names.reference_state_dict(variables, config)
 
@@ -56,7 +59,7 @@ def test_there_and_back(tiny, tmp_path):
     torch_writer.write_zip(tmp_path / "a.ckpt", checkpoint_of(state_dict))
     run_convert(tmp_path / "a.ckpt", tmp_path / "runs" / "a")
     model, loaded = muvo_jax.load(tmp_path / "runs" / "a")
-    for field in ("numerics", "latent", "heads", "image_size", "range_view", "token_channels"):
+    for field in ("numerics", "latent", "variant", "heads", "navigation", "backbone", "image_size", "range_view"):
         assert getattr(model.config, field) == getattr(config, field)
     jax.tree.map(np.testing.assert_array_equal, dict(loaded), variables)
     report = json.loads((tmp_path / "runs" / "a" / convert.REPORT_FILE).read_text())

@@ -124,7 +124,7 @@ def dream_window(model: world_model.WorldModel, variables: types.Variables, key:
                  context: int, horizon: int, branches: int) -> list[dict[str, np.ndarray]]:
     """Frames [B, context + horizon, ...] of each future: the mean one, or `branches` sampled ones."""
     sampled = branches > 1
-    heads = tuple(head for head in protocol.HEADS if head in model.config.heads)
+    heads = protocol.shown_heads(model.config)
     observed = rollout.observe(model, variables, key, batch.time_slice(0, context), sampled=False)
     actions = jnp.asarray(batch.action)[:, context - 1 : context + horizon - 1]
     imagined = rollout.imagine(model, variables, key, observed.last, actions, branches=branches, sampled=sampled)

@@ -27,6 +27,9 @@ METRICS = {
     "precision_observed": ("precision", 4, True), "recall_observed": ("recall", 4, True),
     "iou_occ_all": ("IoU+, unknown = empty", 4, True), "iou_empty_all": ("IoU-, unknown = empty", 4, True),
     "precision_all": ("precision, unknown = empty", 4, True), "recall_all": ("recall, unknown = empty", 4, True),
+    "depth_error_m": ("depth error (m)", 2, False), "semantic_image_share": ("semantic image, share right", 4, True),
+    "semantic_range_view_share": ("semantic range view, share right", 4, True),
+    "birds_eye_share": ("bird's-eye view, share right", 4, True),
 }
 SOURCES = {"model": "model", "copy_last": "copy-last", "training_mean": "training mean"}
 

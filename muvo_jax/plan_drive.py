@@ -152,17 +152,20 @@ def town_simulator(town: simulator.Town, config: config_lib.Config) -> closed_lo
         return closed_loop.Situation(float(state.progress) * simulator.ROUTE_STEP_M, collided,
                                      over and not collided and not arrived, arrived and not collided)
 
-    return closed_loop.Simulator(reset, step, lambda state: observation(town.render(state), config), situation,
+    return closed_loop.Simulator(reset, step, lambda state: observation(town, state, config), situation,
                                  town.expert, config.data.stride / config.contract.rate_hz)
 
 
-def observation(seen, config: config_lib.Config) -> dict[str, Any]:
-    """What the model reads of a rendered moment, and what rewards need: fields of types.Batch without B and T."""
+def observation(town: simulator.Town, state: simulator.TownState, config: config_lib.Config) -> dict[str, Any]:
+    """What the model reads of a moment in the town, and what rewards need: fields of types.Batch without B and T."""
+    seen = town.render(state)
     fields = {"image": seen["image"], "range_view": seen["range_view"], "route_map": seen["route_map"],
               "speed_mps": np.float32(seen["speed_mps"])}
     if config.model.lidar == "pp":
         fields["points"], fields["point_count"] = prepare.padded_points(seen["points_m"], config.model.pillars.points,
                                                                         0)
+    if config.model.camera == "bev":
+        fields |= {"intrinsics": town.renderer.intrinsics, "camera_to_ego": town.renderer.camera_to_ego}
     return fields
 
 

@@ -16,7 +16,7 @@ import numpy as np
 
 from muvo_jax import config as config_lib
 from muvo_jax import types
-from muvo_jax.metrics import baselines, image, occupancy, points, streaming
+from muvo_jax.metrics import baselines, image, maps, occupancy, points, streaming
 from muvo_jax.model import rollout, world_model
 
 VERSION = "muvo_jax-1"
@@ -47,7 +47,7 @@ def predict(model: world_model.WorldModel, variables: types.Variables, key: type
 
     Returns:
       {"image": float32 [B, context + horizon, H, W, 3] in [0, 1], "range_view": float32 [...] in metres, "occupancy":
-      bool [B, context + horizon, X, Y, Z]}, for the heads that the model has.
+      bool [B, context + horizon, X, Y, Z]}, for the heads that the model has; of optional heads see maps.finish.
     """
     return jax.device_get(_predict(model, variables, key, batch, context, horizon, sampled))
 
@@ -59,13 +59,22 @@ def _predict(model, variables, key, batch, context, horizon, sampled):
     actions = batch.action[:, context - 1 : context + horizon - 1]
     dream = rollout.imagine(model, variables, key_imagine, observed.last, actions, sampled=sampled)
     states = jax.tree.map(lambda *parts: jax.numpy.concatenate(parts, axis=1), observed.states, dream.states)
-    heads = tuple(head for head in HEADS if head in model.config.heads)
+    heads = shown_heads(model.config)
     return finish({head: scales[1] for head, scales in model.decode(variables, states.features, heads).items()})
 
 
+def shown_heads(config: config_lib.ModelConfig) -> tuple[str, ...]:
+    """The heads of a model whose frames are scored and drawn."""
+    return tuple(head for head in (*HEADS, *maps.FIELDS) if head in config.heads)
+
+
 def finish(full: Mapping[str, types.Array]) -> dict[str, types.Array]:
-    """Full-scale predictions as frames: the image clipped to [0, 1], occupancy decided at probability 0.5."""
-    frames = dict(full)
+    """Full-scale predictions as frames: the image clipped to [0, 1], occupancy decided at probability 0.5.
+
+    What optional heads draw stands under the names of types.Batch (maps.finish).
+    """
+    frames = {head: value for head, value in full.items() if head not in maps.FIELDS}
+    frames |= maps.finish({head: value for head, value in full.items() if head in maps.FIELDS})
     if "image" in frames:
         frames["image"] = jax.numpy.clip(frames["image"], 0.0, 1.0)
     if "occupancy" in frames:
@@ -78,7 +87,8 @@ class Tally:
 
     def __init__(self, steps: int, evaluation: config_lib.EvaluationConfig):
         self._evaluation = evaluation
-        self._means = {name: streaming.StreamingMean.zeros(steps) for name in ("psnr_db", "chamfer_m")}
+        self._means = {name: streaming.StreamingMean.zeros(steps) for name in (
+            "psnr_db", "chamfer_m", *(score for _, score in maps.FIELDS.values()))}
         self._occupancy = occupancy.OccupancyScores.zeros(steps)
         self._seen: set[str] = set()
 
@@ -96,11 +106,17 @@ class Tally:
             self._means["chamfer_m"] = self._means["chamfer_m"].add(distances)
         if "occupancy" in present:
             self._occupancy = self._occupancy.add(prediction["occupancy"], np.asarray(truth.occupancy))
+        for head, (field, score) in maps.FIELDS.items():
+            if field in prediction and getattr(truth, field) is not None:
+                values = maps.frame_scores(head, np.asarray(prediction[field]), np.asarray(getattr(truth, field)))
+                self._means[score] = self._means[score].add(values)
+                self._seen.add(head)
 
     def scores(self) -> dict[str, dict[str, Any]]:
         """{metric: {"mean", "per_step", "frames", "undefined"}}; NaN where nothing was defined."""
         result: dict[str, dict[str, Any]] = {}
-        for name, head in (("psnr_db", "image"), ("chamfer_m", "range_view")):
+        optional = tuple((score, head) for head, (_, score) in maps.FIELDS.items())
+        for name, head in (("psnr_db", "image"), ("chamfer_m", "range_view"), *optional):
             if head in self._seen:
                 mean = self._means[name]
                 result[name] = {"mean": mean.overall(), "per_step": mean.per_step().tolist(),

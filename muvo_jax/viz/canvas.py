@@ -5,6 +5,7 @@ A picture is a uint8 array [rows, columns, 3]. Pillow draws text and writes file
 
 from __future__ import annotations
 
+import colorsys
 import functools
 import os
 import pathlib
@@ -27,6 +28,15 @@ TAG_COLOURS = {"observed": OBSERVED, "imagined": IMAGINED}
 RANGE_COLOURS = ((255, 247, 188), (254, 196, 79), (241, 105, 60), (180, 40, 110), (88, 24, 116), (34, 16, 70))
 HEIGHT_COLOURS = ((48, 62, 120), (44, 123, 182), (38, 168, 146), (136, 202, 88), (250, 216, 74), (240, 120, 60),
                   (205, 42, 62))
+
+
+def class_colours(classes: int) -> np.ndarray:
+    """uint8 [256, 3]: a colour for each class number, unlike its neighbours'; black for 255, unlabelled."""
+    hues = [colorsys.hsv_to_rgb(0.618034 * index % 1.0, 0.55 + 0.3 * (index % 2), 0.95 - 0.3 * (index % 3 == 2))
+            for index in range(classes)]
+    table = np.zeros((256, 3), np.uint8)
+    table[:classes] = (255.0 * np.asarray(hues)).round()
+    return table
 
 
 def colour_map(values: np.ndarray, anchors: Sequence[Colour]) -> np.ndarray:

@@ -17,6 +17,7 @@ NO_RETURN = (12, 13, 18)
 UNKNOWN = (44, 47, 58)
 EGO = (250, 250, 250)
 SKY = (20, 23, 31)
+MOST_CLASSES = 32
 EGO_LENGTH_M, EGO_WIDTH_M = 4.6, 2.0
 
 
@@ -35,6 +36,23 @@ def range_image(range_view: np.ndarray, *, far_m: float, threshold_m: float = 1.
     range_m = np.asarray(range_view)[..., 3]
     colours = canvas.colour_map(np.sqrt(np.clip(range_m / far_m, 0.0, 1.0)), canvas.RANGE_COLOURS)
     return np.where((range_m > threshold_m)[..., None], colours, np.array(NO_RETURN, np.uint8))
+
+
+def depth_image(depth_m: np.ndarray, *, far_m: float) -> np.ndarray:
+    """Distances [H, W] in metres in the colours of `range_image`; what is not positive is near black."""
+    return range_image(np.repeat(depth_m[..., None], 4, axis=-1), far_m=far_m, threshold_m=0.0)
+
+
+def class_image(classes: np.ndarray) -> np.ndarray:
+    """Class numbers [H, W], each in its colour; 255, unlabelled, is black."""
+    return canvas.class_colours(MOST_CLASSES)[classes]
+
+
+def ground_plan(classes: np.ndarray, side_px: int) -> np.ndarray:
+    """Class numbers [X, Y] from above: forward up, left left; background near black."""
+    picture = class_image(classes)
+    picture[classes == 0] = NO_RETURN
+    return canvas.resize_hard(np.ascontiguousarray(picture[::-1, ::-1]), side_px)
 
 
 def height_fraction(height_m: np.ndarray, height_span_m: tuple[float, float]) -> np.ndarray:

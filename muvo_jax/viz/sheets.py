@@ -28,11 +28,21 @@ class View:
       image: uint8 or float in [0, 1], [H, W, 3].
       range_view: float32 [Hr, Wr, 4], metres.
       occupancy: uint8 [X, Y, Z], 0 empty, 1 occupied, 255 unknown.
+      depth_m, image_classes, range_view_classes, birds_eye_classes: as in types.Batch, where optional heads draw them.
     """
 
     image: np.ndarray | None = None
     range_view: np.ndarray | None = None
     occupancy: np.ndarray | None = None
+    depth_m: np.ndarray | None = None
+    image_classes: np.ndarray | None = None
+    range_view_classes: np.ndarray | None = None
+    birds_eye_classes: np.ndarray | None = None
+
+    def beside(self, truth: View) -> View:
+        """Without the optional maps that the truth lacks, so that their panels stand side by side."""
+        names = ("depth_m", "image_classes", "range_view_classes", "birds_eye_classes")
+        return dataclasses.replace(self, **{name: None for name in names if getattr(truth, name) is None})
 
 
 @dataclasses.dataclass(frozen=True)
@@ -77,8 +87,8 @@ def views_of_batch(batch: types.Batch, sample: int) -> list[View]:
     """The recorded frames of one window."""
     def at(field, frame):
         return None if field is None else np.asarray(field[sample, frame])
-    return [View(at(batch.image, frame), at(batch.range_view, frame), at(batch.occupancy, frame))
-            for frame in range(batch.frames)]
+    names = [field.name for field in dataclasses.fields(View)]
+    return [View(**{name: at(getattr(batch, name), frame) for name in names}) for frame in range(batch.frames)]
 
 
 def views_of_frames(frames: Mapping[str, np.ndarray], sample: int | tuple[int, ...]) -> list[View]:
@@ -170,6 +180,8 @@ def write_dream(folder: str | os.PathLike, truth: Sequence[View], predictions: M
       animate: also write the animation.
     """
     folder = pathlib.Path(folder)
+    predictions = {label: [view.beside(truth[frame]) for frame, view in enumerate(views)]
+                   for label, views in predictions.items()}
     dream = next(iter(predictions.values()))
     moments = [Moment(truth[frame], dream[frame], "observed" if frame < context else "imagined",
                       (frame - context + 1) * scene.frame_s, actions[frame]) for frame in range(len(truth))]
@@ -209,6 +221,11 @@ def _wide_panels(view: View, scene: Scene) -> list[np.ndarray]:
     if view.range_view is not None:
         coloured = panels.range_image(view.range_view, far_m=scene.far_m, threshold_m=scene.threshold_m)
         pictures.append(canvas.resize_hard(coloured, WIDE_PX))
+    if view.depth_m is not None:
+        pictures.append(canvas.resize_hard(panels.depth_image(view.depth_m, far_m=scene.far_m), WIDE_PX))
+    for classes in (view.image_classes, view.range_view_classes):
+        if classes is not None:
+            pictures.append(canvas.resize_hard(panels.class_image(classes), WIDE_PX))
     return pictures
 
 
@@ -221,12 +238,15 @@ def _space_panels(view: View, scene: Scene) -> list[np.ndarray]:
     if view.occupancy is not None:
         pictures.append(panels.occupancy_from_above(view.occupancy, scene.grid, columns_px=SQUARE_PX))
         pictures.append(panels.occupancy_from_behind(view.occupancy, scene.grid, size_px=(96, SQUARE_PX)))
+    if view.birds_eye_classes is not None:
+        pictures.append(panels.ground_plan(view.birds_eye_classes, SQUARE_PX))
     return pictures
 
 
 def _space_names(view: View) -> list[str]:
     points = ["points"] if view.range_view is not None else []
-    return points + (["voxels above", "voxels ahead"] if view.occupancy is not None else [])
+    voxels = ["voxels above", "voxels ahead"] if view.occupancy is not None else []
+    return points + voxels + (["ground plan"] if view.birds_eye_classes is not None else [])
 
 
 def _row_name(what: str, who: str, rows: int) -> np.ndarray:
@@ -237,10 +257,12 @@ def _row_name(what: str, who: str, rows: int) -> np.ndarray:
 def _view_column(view: View, scene: Scene) -> np.ndarray:
     """All of one moment, WIDE_PX wide: camera, range image, points beside voxels from above, voxels ahead."""
     rows = _wide_panels(view, scene)
-    from_above = _space_panels(view, scene)[:2]
+    from_above = _space_panels(dataclasses.replace(view, birds_eye_classes=None), scene)[:2]
     if from_above:
         rows.append(canvas.stack(from_above, axis=1, gap=WIDE_PX - 2 * SQUARE_PX))
     if view.occupancy is not None:
         rows.append(panels.occupancy_from_behind(view.occupancy, scene.grid, size_px=(150, WIDE_PX)))
+    if view.birds_eye_classes is not None:
+        rows.append(panels.ground_plan(view.birds_eye_classes, SQUARE_PX))
     return canvas.stack(rows, axis=0, gap=6)
 

@@ -9,6 +9,7 @@ from muvo_jax import command_line, plan_drive, presets
 from muvo_jax.agents import closed_loop, planners
 from muvo_jax.data.town import settings
 from muvo_jax.data.town import simulator as town_lib
+from muvo_jax.model import world_model
 
 STEP_S = 0.2
 FAST = planners.PlannerConfig(plans=8, iterations=2, elites=2, kept=1)
@@ -118,6 +119,8 @@ def test_the_town_gives_what_the_model_reads_at_the_models_rate():
     assert seen["image"].shape == (*config.model.image_size, 3) and seen["image"].dtype == np.uint8
     assert seen["range_view"].shape == (config.model.range_view.rows, config.model.range_view.columns, 4)
     assert seen["route_map"].shape == (64, 64)
+    lifted = dataclasses.replace(config, model=dataclasses.replace(config.model, camera="bev"))
+    assert set(plan_drive.observation(town, state, lifted)) >= set(world_model.inputs(lifted.model))
 
 
 def test_help_shows_examples_and_explains_every_option(capsys):

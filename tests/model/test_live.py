@@ -1,5 +1,7 @@
 """Filtering a stream step by step."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -7,7 +9,7 @@ import pytest
 
 from muvo_jax import presets
 from muvo_jax.model import live, rollout, world_model
-from muvo_jax.types import Batch
+from muvo_jax.types import BATCH_FIELDS, Batch
 
 CONFIG = presets.get("tiny").model
 MODEL = world_model.WorldModel(CONFIG)
@@ -36,6 +38,17 @@ def test_a_stream_ends_where_the_window_ends():
         np.testing.assert_allclose(stream.latent.features, observed.states[:, t].features, atol=1e-5)
     assert live._observe_step._cache_size() == before + 1
     assert stream.frame.tolist() == [3]
+
+
+@pytest.mark.parametrize(("lidar", "camera"), [("pp", "wob"), ("rv", "bev")])
+def test_every_sensor_encoder_can_be_streamed(lidar, camera):
+    config = dataclasses.replace(CONFIG, lidar=lidar, camera=camera)
+    model = world_model.WorldModel(config)
+    seen = {name: jax.ShapeDtypeStruct((1, *shape), BATCH_FIELDS[name][0])
+            for name, shape in world_model.inputs(config).items()}
+    step = lambda variables, seen: live.observe_step(model, variables, live.start_live(model, jax.random.key(0)), seen,
+                                                     np.zeros((1, 2), np.float32)).latent.features
+    assert jax.eval_shape(step, model.variable_shapes(), seen).shape == (1, *model.feature_shape)
 
 
 @pytest.mark.parametrize("action, message", [

@@ -165,3 +165,21 @@ def test_resize_hard_keeps_only_colours_that_were_there():
     large = canvas.resize_hard(picture, 13)
     assert large.shape == (8, 13, 3)
     assert {tuple(pixel) for pixel in large.reshape(-1, 3).tolist()} == {(0, 0, 0), (10, 20, 30)}
+
+
+def test_optional_maps_have_panels_where_truth_has_them_too(tmp_path):
+    classes = np.array([[0, 1], [2, 255]], np.uint8)
+    picture = panels.class_image(classes)
+    assert len({tuple(pixel) for pixel in picture.reshape(-1, 3).tolist()}) == 4 and not picture[1, 1].any()
+    plan = panels.ground_plan(np.array([[0, 0], [3, 0]], np.uint8), 2)  # a vehicle ahead on the right
+    np.testing.assert_array_equal(plan[0, 1], panels.class_image(np.array([3], np.uint8))[0])
+    maps = {"depth_m": np.ones((4, 8), np.float32), "image_classes": np.ones((4, 8), np.uint8),
+            "birds_eye_classes": np.ones((4, 4), np.uint8)}
+    truth, dream = sheets.View(**maps), sheets.View(**maps, range_view_classes=np.ones((4, 8), np.uint8))
+    sizes = []
+    for view in (truth, sheets.View(depth_m=maps["depth_m"])):
+        paths = sheets.write_dream(tmp_path, [view] * 2, {"world model": [dream] * 2}, np.zeros((2, 2)), SCENE,
+                                   context=1, title="t", animate=False)
+        sizes.append({path.name: Image.open(path).height for path in paths})
+    assert set(sizes[0]) == {"dream_sensors.png", "dream_space.png"} and set(sizes[1]) == {"dream_sensors.png"}
+    assert sizes[0]["dream_sensors.png"] > sizes[1]["dream_sensors.png"]

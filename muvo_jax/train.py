@@ -280,6 +280,8 @@ def _pretrained(config: config_lib.Config, resume: bool) -> start.Pretrained | N
     if not path:
         return None
     backbone = None if resume else backbones.read(path)
+    if backbone is not None:
+        backbones.check(backbone, config.model)  # before anything is recorded or compiled
     return lambda variables, model: backbones.load_into(variables, backbone or backbones.read(path), model)
 
 

@@ -10,7 +10,7 @@ from typing import Annotated
 import tyro
 
 from muvo_jax import command_line
-from muvo_jax.data import carla_client, carla_recorder
+from muvo_jax.data import carla_client, carla_drives, carla_recorder, voxelizing
 from muvo_jax.training import screen
 
 
@@ -27,16 +27,18 @@ class Options:
     """Print what disk and hours it takes, and stop; needs no server."""
     agent: Annotated[str | None, command_line.shown("MODULE:FUNCTION", "autopilot")] = None
     """The expert: function(vehicle, route) -> agent, agent(observed) -> carla.VehicleControl."""
-    towns: tuple[str, ...] = carla_recorder.TOWNS
+    towns: tuple[str, ...] = carla_drives.TOWNS
     """Maps of the server."""
     train_runs: int = 25
     """Runs for training in each town."""
     val_runs: int = 5
     """Runs in each town for either validation split."""
-    seconds: float = carla_recorder.RUN_S
+    seconds: float = carla_drives.RUN_S
     """Length of a run."""
     seed: int = 0
     """Of weathers, routes and traffic."""
+    occupancy: bool = False
+    """Make the occupancy of all runs, too, at the end (as python -m muvo_jax.voxelize OUT does)."""
     vehicles: int = 80
     """Other cars."""
     walkers: int = 80
@@ -59,19 +61,28 @@ python -m muvo_jax.record_carla recordings/mine --agent=my_driver:make_agent
 
 def record(options: Options, show: screen.Screen) -> None:
     """Does what the command line asks for."""
-    settings = carla_recorder.Settings()
-    jobs = carla_recorder.plan(towns=options.towns, train_runs=options.train_runs, val_runs=options.val_runs,
+    settings = carla_drives.Settings()
+    jobs = carla_drives.plan(towns=options.towns, train_runs=options.train_runs, val_runs=options.val_runs,
                                run_s=options.seconds, seed=options.seed)
-    needed = carla_recorder.estimate(options.out, jobs, settings)
+    needed = carla_drives.estimate(options.out, jobs, settings)
     show.line(str(needed))
-    if options.estimate or not needed.missing:
+    if options.estimate:
         return
+    if needed.missing:
+        _drive(options, show, settings, jobs)
+    if options.occupancy:
+        with show.counter("voxelizing", "frames") as progress:
+            voxelizing.voxelize(options.out, progress=progress)
+    show.line(f"{len(jobs)} runs are complete in {options.out}.")
+
+
+def _drive(options: Options, show: screen.Screen, settings: carla_drives.Settings,
+           jobs: list[carla_drives.Job]) -> None:
     make_agent = carla_client.load_agent(options.agent) if options.agent else None
     client = carla_client.Client(settings, host=options.host, port=options.port, traffic_port=options.traffic_port,
                                  vehicles=options.vehicles, walkers=options.walkers, make_agent=make_agent)
     with show.counter("recording", "frames") as progress:
         carla_recorder.record(options.out, client, jobs, settings, progress=progress)
-    show.line(f"{len(jobs)} runs are complete in {options.out}.")
 
 
 def main() -> int:

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from muvo_jax.data import carla_recorder
+from muvo_jax.data import carla_drives, carla_frames
 
 EGO_BLUEPRINT = "vehicle.lincoln.mkz_2017"  # carla_files.EGO_BOX_M is its size
 WARM_UP_TICKS = 20  # the car settles, sensors start
@@ -19,7 +19,7 @@ _FASTEST_MPS = 30.0
 _WALKING_MPS = 1.4
 
 # make_agent(ego vehicle, route [P, 2]) -> agent(Observed) -> carla.VehicleControl
-Agent = Callable[[carla_recorder.Observed], Any]
+Agent = Callable[[carla_frames.Observed], Any]
 
 
 def import_carla() -> Any:
@@ -27,7 +27,7 @@ def import_carla() -> Any:
     try:
         return importlib.import_module("carla")
     except ImportError as error:
-        raise carla_recorder.CarlaError(f"the CARLA client cannot be imported ({error}); install it with  "
+        raise carla_drives.CarlaError(f"the CARLA client cannot be imported ({error}); install it with  "
                                         f"pip install 'muvo_jax[carla]'") from error
 
 
@@ -53,13 +53,23 @@ def server_errors(where: str):
     try:
         yield
     except RuntimeError as error:
-        raise carla_recorder.CarlaError(f"{where}: {error} Is the server up and of the client's version?") from error
+        raise carla_drives.CarlaError(f"{where}: {error} Is the server up and of the client's version?") from error
+
+
+def drained(events: queue.Queue) -> bool:
+    """Empties a queue; whether anything was in it."""
+    count = 0
+    with contextlib.suppress(queue.Empty):
+        while True:
+            events.get_nowait()
+            count += 1
+    return count > 0
 
 
 class Client:
     """See carla_recorder.Simulator. Without an agent the traffic manager's autopilot drives along the route."""
 
-    def __init__(self, settings: carla_recorder.Settings, *, host: str = "127.0.0.1", port: int = 2000,
+    def __init__(self, settings: carla_drives.Settings, *, host: str = "127.0.0.1", port: int = 2000,
                  traffic_port: int = 8000, vehicles: int = 80, walkers: int = 80, timeout_s: float = 60.0,
                  make_agent: Callable[[Any, np.ndarray], Agent] | None = None):
         """Raises CarlaError where carla is not installed, no server answers, or it is of another version."""
@@ -75,10 +85,10 @@ class Client:
             self._client.set_timeout(timeout_s)
             versions = self._client.get_client_version(), self._client.get_server_version()
         if versions[0] != versions[1]:  # semantic tags depend on it
-            raise carla_recorder.CarlaError(f"{self._where}: client {versions[0]}, server {versions[1]}; expected "
+            raise carla_drives.CarlaError(f"{self._where}: client {versions[0]}, server {versions[1]}; expected "
                                             f"equal versions.")
 
-    def start(self, job: carla_recorder.Job) -> carla_recorder.Observed:
+    def start(self, job: carla_drives.Job) -> carla_frames.Observed:
         with server_errors(f"{self._where}, starting {job.split}/{job.run}"):
             rng = np.random.default_rng(job.seed)
             self._world = self._client.load_world(job.town)
@@ -101,7 +111,7 @@ class Client:
                 self._world.tick(self._timeout_s)
             return self._tick()
 
-    def step(self) -> carla_recorder.Observed:
+    def step(self) -> carla_frames.Observed:
         with server_errors(f"{self._where}, driving"):
             if self._agent is not None:
                 self._ego.apply_control(self._agent(self._observed))
@@ -125,12 +135,12 @@ class Client:
             self._client.get_trafficmanager(self._traffic_port).set_synchronous_mode(False)
         self._actors, self._controllers = [], []
 
-    def _tick(self) -> carla_recorder.Observed:
+    def _tick(self) -> carla_frames.Observed:
         frame = self._world.tick(self._timeout_s)
-        measurements = carla_recorder.collect(self._queues, frame, self._timeout_s)
-        self._observed = carla_recorder.Observed(
+        measurements = carla_frames.collect(self._queues, frame, self._timeout_s)
+        self._observed = carla_frames.Observed(
             frame, self._world.get_snapshot().timestamp.elapsed_seconds, self._ego.get_transform(),
-            self._ego.get_velocity(), self._ego.get_control(), measurements)
+            self._ego.get_velocity(), self._ego.get_control(), measurements, collided=drained(self._collisions))
         return self._observed
 
     def _make_synchronous(self, traffic: Any, seed: int) -> None:
@@ -148,8 +158,8 @@ class Client:
         """A random way through the lanes, as carla.Location; the agent and the route map get it in metres."""
         waypoint = self._world.get_map().get_waypoint(start)
         waypoints = [waypoint]
-        for _ in range(int(duration_s * _FASTEST_MPS / carla_recorder.ROUTE_SPACING_M)):
-            choices = waypoints[-1].next(carla_recorder.ROUTE_SPACING_M)
+        for _ in range(int(duration_s * _FASTEST_MPS / carla_frames.ROUTE_SPACING_M)):
+            choices = waypoints[-1].next(carla_frames.ROUTE_SPACING_M)
             if not choices:
                 break
             waypoints.append(choices[rng.integers(len(choices))])
@@ -201,6 +211,8 @@ class Client:
             sensor = self._spawn(self._blueprint(f"sensor.{kind}", **attributes), mount, self._ego)
             self._queues[name] = queue.Queue()
             sensor.listen(self._queues[name].put)
+        self._collisions: queue.Queue = queue.Queue()
+        self._spawn(self._blueprint("sensor.other.collision"), mount, self._ego).listen(self._collisions.put)
 
     def _blueprint(self, name: str, **attributes: Any) -> Any:
         blueprint = self._world.get_blueprint_library().find(name)

@@ -1,7 +1,6 @@
-"""Records drives in CARLA in the plain format: plan, estimate, decoding, health checks. Nothing here imports carla.
+"""Records drives in CARLA in the plain format: the loop, health checks, resuming. Nothing here imports carla.
 
-A `Simulator` (carla_client.py, or a test's) hands over the client's own measurements: BGRA images, depth in three
-bytes, semantic tags in the red channel, lidar detections of 24 bytes. Right-handed from here on: y left.
+A `Simulator` (carla_client.py, or a test's) hands over the client's own measurements; carla_frames.py decodes them.
 """
 
 from __future__ import annotations
@@ -9,94 +8,24 @@ from __future__ import annotations
 import dataclasses
 import math
 import pathlib
-import queue
 import shutil
 import zlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from typing import Any, NamedTuple, Protocol
+from typing import Protocol
 
 import numpy as np
-from PIL import Image, ImageDraw
 
-from muvo_jax import config as config_lib
-from muvo_jax.data import carla, carla_files, plain, recorder, schema
+from muvo_jax.data import carla, carla_frames, processes, recorder, schema
+from muvo_jax.data.carla_drives import SPLITS, BadDriveError, CarlaError, Job, Settings, estimate
+from muvo_jax.data.carla_frames import SENSORS, Observed
 from muvo_jax.ops import camera as camera_ops
 
-# The paper's section IV: 25 runs of 300 s in each town for training, 5 in each for either validation set.
-TOWNS = ("Town01", "Town03", "Town04", "Town06")
-WEATHERS = ("ClearNoon", "WetNoon", "HardRainNoon", "ClearSunset")
-SHIFTED_WEATHERS = ("CloudyNoon", "WetSunset", "SoftRainSunset", "MidRainyNoon")  # the paper names none
-SPLITS = ("train", "val_rl", "val_ds")
-RUN_S = 300.0
-CAMERAS = ("image", "depth", "classes")
-SENSORS = (*CAMERAS, "lidar")
-_DETECTION = np.dtype([("point", "<f4", 3), ("cos_angle", "<f4"), ("object", "<u4"), ("tag", "<u4")])
-# The layout's route map: 192 pixels, 5 a metre, the ego vehicle 32 above the lower edge; its reader takes every third.
-_ROUTE_PX, _ROUTE_PX_PER_M, _EGO_ROW, _ROUTE_WIDTH_PX, _ROUTE_STEP = 192, 5.0, 160, 16, 3
-_ROUTE_AHEAD = 40  # points drawn, and searched for the nearest
-ROUTE_SPACING_M = 2.0
 ATTEMPTS = 3
 MOVING_MPS = 1.0
 FROZEN_FRAMES = 10
 BLOCKED_S = 90.0
 OFF_ROUTE_M = 12.0
-
-
-class CarlaError(OSError):
-    """The simulator or a sensor does not do what a recording needs; the message says which, when and what to try."""
-
-
-class BadDriveError(CarlaError):
-    """The car is stuck or off its route: the sensors are fine and another seed may do."""
-
-
-@dataclasses.dataclass(frozen=True)
-class Settings:
-    """Sensors and rate; the defaults are the paper's (points_per_frame: its upper bound).
-
-    Attributes:
-      position_m: of cameras and lidar in the ego frame; they look straight ahead.
-    """
-
-    width_px: int = 960
-    height_px: int = 600
-    fov_rad: float = carla.FOV_RAD
-    position_m: tuple[float, float, float] = carla.MOUNT_M
-    lidar_rows: int = 64
-    lidar_range_m: float = 100.0
-    points_per_frame: int = 60_000
-    rate_hz: float = carla.RATE_HZ
-
-    @property
-    def lidar(self) -> config_lib.RangeViewGeometry:
-        return dataclasses.replace(carla.LIDAR, rows=self.lidar_rows, position_m=self.position_m)
-
-    @property
-    def raw_bytes(self) -> int:
-        """A frame's size before compression: RGB, 16-bit depth, classes, points with tags, route map."""
-        return self.width_px * self.height_px * (3 + 2 + 1) + self.points_per_frame * 13 + 64 * 64
-
-
-class Job(NamedTuple):
-    """One run to record."""
-
-    split: str
-    run: str
-    town: str
-    weather: str
-    seed: int
-    frames: int
-
-
-class Observed(NamedTuple):
-    """One tick. transform, velocity and control are the client's; `control` led from the tick before to this one."""
-
-    frame: int
-    timestamp_s: float
-    transform: Any
-    velocity: Any
-    control: Any
-    measurements: Mapping[str, Any]
+_IN_LANE_M = 2.0
 
 
 class Simulator(Protocol):
@@ -119,63 +48,23 @@ class Simulator(Protocol):
         ...
 
 
-def plan(*, towns: Sequence[str] = TOWNS, train_runs: int = 25, val_runs: int = 5, run_s: float = RUN_S,
-         rate_hz: float = carla.RATE_HZ, seed: int = 0) -> list[Job]:
-    """The paper's runs: train, val_rl (same weathers) and val_ds (others), weathers drawn at random."""
-    jobs = []
-    runs_of, weathers_of = (train_runs, val_runs, val_runs), (WEATHERS, WEATHERS, SHIFTED_WEATHERS)
-    for number, (split, runs, weathers) in enumerate(zip(SPLITS, runs_of, weathers_of, strict=True)):
-        for town in towns:
-            for index in range(runs):
-                rng = np.random.default_rng([seed, number, index, *town.encode()])
-                jobs.append(Job(split, f"{town}_{index:03d}", town, str(rng.choice(weathers)),
-                                int(rng.integers(1 << 30)), round(run_s * rate_hz)))
-    return jobs
-
-
-class Estimate(NamedTuple):
-    """What recording the missing runs takes. `measured`: from a complete run; else sizes before compression and the
-    time that the drives themselves last."""
-
-    frames: int
-    missing: int
-    disk_bytes: float
-    hours: float
-    measured: bool
-
-    def __str__(self) -> str:
-        how = "measured on a run that is there" if self.measured else (
-            "bounds before the first run: disk before compression, hours if the simulator keeps up with the clock")
-        return (f"{self.missing} of {self.frames} frames are missing: {self.disk_bytes / 1e9:.1f} GB and "
-                f"{self.hours:.1f} hours ({how}).")
-
-
-def estimate(out: pathlib.Path, jobs: Sequence[Job], settings: Settings) -> Estimate:
-    """See Estimate."""
-    complete = [job for job in jobs if recorder.is_complete(out, job.split, job.run)]
-    frames = sum(job.frames for job in jobs)
-    missing = frames - sum(job.frames for job in complete)
-    frame_bytes, frame_s = float(settings.raw_bytes), 1.0 / settings.rate_hz
-    if complete:
-        folder = out / complete[0].split / complete[0].run
-        written = [path.stat() for path in folder.rglob("*") if path.is_file()]
-        times = [status.st_mtime for status in written]
-        rows = len((folder / plain.FRAMES_FILE).read_text(encoding="utf-8").splitlines()) - 1
-        frame_bytes = sum(status.st_size for status in written) / rows
-        frame_s = (max(times) - min(times)) / rows
-    return Estimate(frames, missing, missing * frame_bytes, missing * frame_s / 3600, bool(complete))
-
-
 def record(out: pathlib.Path, simulator: Simulator, jobs: Sequence[Job], settings: Settings, *,
            progress: Callable[[int, int], None] | None = None) -> None:
     """Records every run that is not complete.
 
     Raises:
       FileExistsError: where OUT holds a recording of other sensors.
+      BlockingIOError: where another process records into OUT now.
       CarlaError: where a sensor stalls, is blank or frozen, nothing is written, the disk is too small, or a drive
         fails ATTEMPTS times. The run in question stays incomplete and is recorded again next time.
     """
     _describe(out, settings)
+    with processes.locked(out / ".recording", "recording"):
+        _record_missing(out, simulator, jobs, settings, progress)
+
+
+def _record_missing(out: pathlib.Path, simulator: Simulator, jobs: Sequence[Job], settings: Settings,
+                    progress: Callable[[int, int], None] | None) -> None:
     for job in jobs:
         if recorder.is_complete(out, job.split, job.run):
             continue
@@ -200,18 +89,20 @@ def record_run(out: pathlib.Path, simulator: Simulator, job: Job, settings: Sett
     writer = recorder.RunWriter(out, job.split, job.run)
     try:
         seen = simulator.start(job)
-        first, route = seen, Route(simulator.route_m())
+        first, route = seen, carla_frames.Route(simulator.route_m())
         health = Health(job, settings.rate_hz)
         for index in range(job.frames):
             following = simulator.step()
-            pose, speed_mps = pose_of(seen.transform), forward_speed(seen.transform, seen.velocity)
-            frame = decode(seen, settings)
+            pose = carla_frames.pose_of(seen.transform)
+            speed_mps = carla_frames.forward_speed(seen.transform, seen.velocity)
+            frame = carla_frames.decode(seen, settings)
             health.check(index, seen, following, frame, speed_mps, route.advance(pose))
             control = following.control  # in force from `seen` to `following`
             writer.write({**frame, "frame_id": index, "timestamp_s": round(seen.timestamp_s - first.timestamp_s, 6),
                           "x_m": pose[0], "y_m": pose[1], "yaw_rad": pose[2], "speed_mps": speed_mps,
                           "acceleration": control.throttle if control.throttle > 0 else -control.brake,
-                          "steering": control.steer, "route_map": route.draw(pose), "weather": job.weather})
+                          "steering": control.steer, "reward": reward(seen.collided, *route.deviation(pose)),
+                          "is_terminal": seen.collided, "route_map": route.draw(pose), "weather": job.weather})
             seen = following
             yield index + 1
         check_written(writer.folder, job.frames)
@@ -220,84 +111,14 @@ def record_run(out: pathlib.Path, simulator: Simulator, job: Job, settings: Sett
         simulator.stop()
 
 
-def collect(queues: Mapping[str, queue.Queue], frame: int, timeout_s: float) -> dict[str, Any]:
-    """Each sensor's measurement of this frame; what is older is passed over.
+def reward(collided: bool, aside_m: float, turned_rad: float) -> float:
+    """-1 on a collision, else how well the car keeps to its route: 1 on it and along it, 0 from 2 m or 90 degrees on.
 
-    Raises:
-      CarlaError: naming the sensor that sends nothing in time or has gone past the frame.
+    The town's reward without its term for the speed, since the speed that traffic allows is not known here.
     """
-    found = {}
-    for name, waiting in queues.items():
-        while name not in found:
-            try:
-                measurement = waiting.get(timeout=timeout_s)
-            except queue.Empty:
-                raise CarlaError(f"sensor {name} stalled: nothing for frame {frame} in {timeout_s:g} s. Restart the "
-                                 f"server (and see that it renders), then run the command again.") from None
-            if measurement.frame > frame:
-                raise CarlaError(f"sensor {name} sent frame {measurement.frame} while {frame} was awaited: another "
-                                 f"client ticks this server, or the sensor dropped a frame.")
-            if measurement.frame == frame:
-                found[name] = measurement
-    return found
-
-
-def decode(seen: Observed, settings: Settings) -> dict[str, np.ndarray]:
-    """The measurements of a tick as recorder.RunWriter.write takes them."""
-    pixels = {name: bgra(seen.measurements[name], name, settings) for name in CAMERAS}
-    detections = np.frombuffer(seen.measurements["lidar"].raw_data, _DETECTION)
-    points_m = carla_files.to_ego_frame(detections["point"], settings.position_m)
-    keep = np.isfinite(points_m).all(axis=1) & ~carla_files.in_ego_box(points_m)
-    return {"image": pixels["image"][..., 2::-1],
-            # Blue is the most significant byte.
-            "depth_m": carla_files.DEPTH_RANGE_M * carla_files.decode_depth(pixels["depth"]),
-            "classes": carla_files.LAYOUT_TAGS[pixels["classes"][..., 2]], "points_m": points_m[keep],
-            "point_tags": carla_files.LAYOUT_TAGS[np.minimum(detections["tag"][keep], 255)]}
-
-
-def bgra(measurement: Any, name: str, settings: Settings) -> np.ndarray:
-    """A camera's raw_data, uint8 [H, W, 4]; raises CarlaError for another size than asked for."""
-    pixels = np.frombuffer(measurement.raw_data, np.uint8)
-    shape = (settings.height_px, settings.width_px, 4)
-    if (measurement.height, measurement.width) != shape[:2] or pixels.size != math.prod(shape):
-        raise CarlaError(f"sensor {name}: {measurement.width}x{measurement.height} pixels in {pixels.size} bytes, "
-                         f"expected {settings.width_px}x{settings.height_px} of 4 bytes.")
-    return pixels.reshape(shape)
-
-
-def pose_of(transform: Any) -> tuple[float, float, float]:
-    """x_m, y_m, yaw_rad, right-handed, of a carla.Transform."""
-    return transform.location.x, -transform.location.y, -math.radians(transform.rotation.yaw)
-
-
-def forward_speed(transform: Any, velocity: Any) -> float:
-    """Metres a second along the car's axis; negative when it rolls back."""
-    pitch, yaw = math.radians(transform.rotation.pitch), math.radians(transform.rotation.yaw)
-    return (math.cos(pitch) * (velocity.x * math.cos(yaw) + velocity.y * math.sin(yaw)) + velocity.z * math.sin(pitch))
-
-
-class Route:
-    """A planned route, and how far along it the car is."""
-
-    def __init__(self, points_m: np.ndarray):
-        self._points_m, self._next = np.asarray(points_m, np.float64), 0
-
-    def advance(self, pose: tuple[float, float, float]) -> float:
-        """Moves on to the nearest point ahead; returns the distance to it, metres."""
-        ahead = self._points_m[self._next:self._next + _ROUTE_AHEAD]
-        distances_m = np.hypot(*(ahead - pose[:2]).T)
-        self._next += int(distances_m.argmin())
-        return float(distances_m.min())
-
-    def draw(self, pose: tuple[float, float, float]) -> np.ndarray:
-        """The way ahead from above, uint8 [64, 64], 255 on the route, forward is up."""
-        offset = self._points_m[self._next:self._next + _ROUTE_AHEAD] - pose[:2]
-        cosine, sine = math.cos(pose[2]), math.sin(pose[2])
-        forward, left = offset[:, 0] * cosine + offset[:, 1] * sine, offset[:, 1] * cosine - offset[:, 0] * sine
-        picture = Image.new("L", (_ROUTE_PX, _ROUTE_PX))
-        line = np.stack([_ROUTE_PX / 2 - left * _ROUTE_PX_PER_M, _EGO_ROW - forward * _ROUTE_PX_PER_M], axis=1)
-        ImageDraw.Draw(picture).line(list(map(tuple, line.tolist())), fill=255, width=_ROUTE_WIDTH_PX)
-        return np.asarray(picture)[::_ROUTE_STEP, ::_ROUTE_STEP]
+    if collided:
+        return -1.0
+    return max(0.0, 1.0 - aside_m / _IN_LANE_M) * max(0.0, math.cos(turned_rad))
 
 
 class Health:
@@ -353,5 +174,5 @@ def _describe(out: pathlib.Path, settings: Settings) -> None:
     camera = schema.Camera(settings.width_px, settings.height_px, tuple(map(tuple, intrinsics.tolist())),
                            tuple(map(tuple, pose.tolist())))
     recorder.write_description(out, name="CARLA", rate_hz=settings.rate_hz, camera=camera, lidar=settings.lidar,
-                               splits=SPLITS,
+                               voxels=carla.VOXELS, splits=SPLITS,
                                contract=dataclasses.replace(carla.CONTRACT, rate_hz=settings.rate_hz))

@@ -80,7 +80,9 @@ class PlainRecording:
         self.sequences = tuple(sequence for name, run in self._runs.items()
                                for sequence in _cut(run, name, modalities, self._files, 1.0 / rate_hz))
         lidar = description.section(header, "lidar", toml_path, required="points_m" in modalities)
-        voxels = description.section(header, "voxels", toml_path, required="occupancy" in modalities)
+        voxels = None
+        if "occupancy" in modalities or "birds_eye_classes" in modalities:  # [voxels] alone says what to make
+            voxels = description.section(header, "voxels", toml_path, required=True)
         contract = description.section(header, "action", toml_path, required=True)
         camera = description.section(header, "camera", toml_path, required="image" in modalities)
         self.description = schema.RecordingDescription(

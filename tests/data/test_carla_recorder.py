@@ -11,10 +11,20 @@ import numpy as np
 import pytest
 
 from muvo_jax import command_line, record_carla
-from muvo_jax.data import carla_client, carla_files, carla_recorder, plain, recorder
+from muvo_jax.data import (
+    carla_client,
+    carla_drives,
+    carla_files,
+    carla_frames,
+    carla_recorder,
+    plain,
+    processes,
+    recorder,
+    voxelizing,
+)
 
-SETTINGS = carla_recorder.Settings(width_px=24, height_px=16, points_per_frame=50)
-JOB = carla_recorder.Job("train", "Town01_000", "Town01", "ClearNoon", 3, 14)
+SETTINGS = carla_drives.Settings(width_px=24, height_px=16, points_per_frame=50)
+JOB = carla_drives.Job("train", "Town01_000", "Town01", "ClearNoon", 3, 14)
 needs_carla = pytest.mark.skipif(importlib.util.find_spec("carla") is None, reason="carla is not installed")
 DETECTION = np.dtype("<f4, <f4, <f4, <f4, <u4, <u4")  # x, y, z, cosine, object, tag: 24 bytes
 
@@ -60,10 +70,10 @@ class FakeSimulator:
     def observe(self):
         rng, index = np.random.default_rng(self.tick), self.tick - 100
         pictures = {name: camera(self.tick, rng.integers(0, 20, (16, 24, 4), np.uint8))
-                    for name in carla_recorder.CAMERAS}
+                    for name in carla_frames.CAMERAS}
         rows = [(10 + index, 4, -2, 0.5, 7, 24), (0, 0, -1, 0.5, 1, 14), (20, -3, 1, 0.5, 9, 14)]
         control = types.SimpleNamespace(throttle=0.0 if index % 2 else 0.5, steer=0.01 * index, brake=0.25)
-        return self.spoil(carla_recorder.Observed(
+        return self.spoil(carla_frames.Observed(
             self.tick, self.tick * 0.1, transform(0.0, 0.1 * self.speed_mps * index, 90.0), vector(y=self.speed_mps),
             control, {**pictures, "lidar": scan(self.tick, rows)}))
 
@@ -88,6 +98,40 @@ def test_a_drive_is_a_plain_recording_in_the_ego_frame(tmp_path):
     assert recording.description.camera.intrinsics[0][0] == pytest.approx(12 / math.tan(math.radians(55)), rel=1e-6)
 
 
+def test_a_collision_is_the_end_of_a_sequence_and_costs(tmp_path):
+    carla_recorder.record(tmp_path, FakeSimulator(lambda seen: seen._replace(collided=seen.frame == 104)), [JOB],
+                          SETTINGS)
+    recording = plain.PlainRecording(tmp_path)
+    assert [sequence.length for sequence in recording.sequences] == [5, 9]
+    frames = [recording.read(recording.sequences[0], index) for index in (3, 4)]
+    assert [(frame["reward"], bool(frame["is_terminal"])) for frame in frames] == [(1.0, False), (-1.0, True)]
+    route = carla_frames.Route(np.array([(0.0, 0.0), (2.0, 0.0), (4.0, 0.0)]))
+    assert route.deviation((1.0, -0.5, math.pi / 3)) == pytest.approx((0.5, math.pi / 3))
+    assert carla_recorder.reward(False, 0.5, math.pi / 3) == pytest.approx(0.75 * 0.5)
+    assert carla_recorder.reward(False, 3.0, 0.0) == carla_recorder.reward(False, 0.0, 3.0) == 0.0
+    events = queue.Queue()
+    events.put("hit")
+    assert [carla_client.drained(events) for _ in range(2)] == [True, False]
+
+
+def test_a_recording_can_be_voxelized_and_until_then_has_no_occupancy(tmp_path):
+    carla_recorder.record(tmp_path, FakeSimulator(), [JOB._replace(frames=2)], SETTINGS)
+    described = plain.PlainRecording(tmp_path).description
+    assert described.voxels is None and "occupancy" not in described.modalities
+    assert voxelizing.voxelize(tmp_path, workers=1).made == 2
+    recording = plain.PlainRecording(tmp_path)
+    frame = recording.read(recording.sequences[0], 0)
+    assert frame["occupancy"].shape == recording.description.voxels.shape == (192, 192, 64)
+    hit = frame["occupancy"][tuple(np.floor((frame["points_m"] - [-48, -48, -6]) / 0.5).astype(int).T)]
+    assert hit.all()
+
+
+def test_a_second_recorder_of_a_folder_is_told(tmp_path):
+    with (processes.locked(tmp_path / ".recording", "recording"),
+          pytest.raises(BlockingIOError, match="another process is recording here")):
+        carla_recorder.record(tmp_path, FakeSimulator(), [JOB], SETTINGS)
+
+
 def test_depth_and_tags_come_from_the_clients_channels():
     depth = np.zeros((16, 24, 4), np.uint8)
     depth[0, 0, :3] = 0, 0, 1  # blue, green, red: the least significant byte is red
@@ -97,7 +141,7 @@ def test_depth_and_tags_come_from_the_clients_channels():
     tags[..., 2], tags[0, 0, 2] = 1, 11
     seen = FakeSimulator(lambda seen: seen._replace(measurements={
         **seen.measurements, "depth": camera(100, depth), "classes": camera(100, tags)})).start(JOB)
-    frame = carla_recorder.decode(seen, SETTINGS)
+    frame = carla_frames.decode(seen, SETTINGS)
     np.testing.assert_allclose(frame["depth_m"][0, :3], np.array([1, 2 ** 24 - 1, 2 ** 20]) * 1000 / (2 ** 24 - 1))
     assert recorder.encode_depth(frame["depth_m"])[0, 1] == recorder.DEPTH_SKY
     assert frame["classes"][0, :2].tolist() == [carla_files.SKY, 7]
@@ -105,7 +149,7 @@ def test_depth_and_tags_come_from_the_clients_channels():
 
 def test_route_bends_to_the_left_in_the_picture_where_it_bends_to_the_left():
     corner = [(2.0 * index, 0.0) for index in range(6)] + [(10.0, 2.0 * index) for index in range(1, 20)]
-    route = carla_recorder.Route(np.array(corner))
+    route = carla_frames.Route(np.array(corner))
     assert route.advance((0.5, 1.0, 0.0)) == pytest.approx(math.hypot(0.5, 1))
     picture = route.draw((0.0, 0.0, 0.0))
     row = round((160 - 10 * 5) / 3)
@@ -128,7 +172,7 @@ def test_complete_runs_stay_and_interrupted_ones_are_recorded_again(tmp_path):
     assert not breaking.running
     before = (tmp_path / "train/Town01_000/frames.csv").stat().st_mtime_ns
     told, again = [], FakeSimulator()
-    needed = carla_recorder.estimate(tmp_path, jobs, SETTINGS)
+    needed = carla_drives.estimate(tmp_path, jobs, SETTINGS)
     assert needed.measured and (needed.frames, needed.missing) == (28, 14) and needed.disk_bytes > 0
     carla_recorder.record(tmp_path, again, jobs, SETTINGS, progress=lambda done, total: told.append((done, total)))
     assert [job.run for job in again.started] == ["Town01_001"] and told[0] == (15, 28) and told[-1] == (28, 28)
@@ -156,7 +200,7 @@ def frozen(seen):
 ])
 def test_sick_sensors_stop_the_recording_and_leave_the_run_incomplete(tmp_path, spoil, message):
     simulator = FakeSimulator(spoil)
-    with pytest.raises(carla_recorder.CarlaError, match=message):
+    with pytest.raises(carla_drives.CarlaError, match=message):
         carla_recorder.record(tmp_path, simulator, [JOB], SETTINGS)
     assert not simulator.running and len(simulator.started) == 1
     assert not recorder.is_complete(tmp_path, JOB.split, JOB.run)
@@ -165,17 +209,17 @@ def test_sick_sensors_stop_the_recording_and_leave_the_run_incomplete(tmp_path, 
 def test_a_bad_drive_is_tried_again_with_other_seeds(tmp_path, monkeypatch):
     monkeypatch.setattr(carla_recorder, "BLOCKED_S", 0.5)
     still = FakeSimulator(speed_mps=0.0)
-    with pytest.raises(carla_recorder.BadDriveError, match=r"has not moved for 0\.5 s"):
+    with pytest.raises(carla_drives.BadDriveError, match=r"has not moved for 0\.5 s"):
         carla_recorder.record(tmp_path, still, [JOB], SETTINGS)
     assert [job.seed for job in still.started] == [3, 4, 5]
     lost = FakeSimulator(lambda seen: seen._replace(transform=transform(30, 0, 90)))
-    with pytest.raises(carla_recorder.BadDriveError, match=r"30\.0 m off its route"):
+    with pytest.raises(carla_drives.BadDriveError, match=r"30\.0 m off its route"):
         carla_recorder.record(tmp_path, lost, [JOB], SETTINGS)
 
 
 def test_a_run_that_writes_nothing_is_an_error(tmp_path, monkeypatch):
     monkeypatch.setattr(recorder.RunWriter, "write", lambda self, frame: None)
-    with pytest.raises(carla_recorder.CarlaError, match=r"image: 0 files for 14 frames"):
+    with pytest.raises(carla_drives.CarlaError, match=r"image: 0 files for 14 frames"):
         carla_recorder.record(tmp_path, FakeSimulator(), [JOB], SETTINGS)
     assert not recorder.is_complete(tmp_path, JOB.split, JOB.run)
 
@@ -183,7 +227,7 @@ def test_a_run_that_writes_nothing_is_an_error(tmp_path, monkeypatch):
 def test_a_disk_that_is_too_small_is_told_after_the_first_run(tmp_path, monkeypatch):
     monkeypatch.setattr(carla_recorder.shutil, "disk_usage", lambda path: types.SimpleNamespace(free=1000))
     jobs, simulator = [JOB, JOB._replace(run="Town01_001")], FakeSimulator()
-    with pytest.raises(carla_recorder.CarlaError, match=r"GB are needed, 0\.0 GB are free"):
+    with pytest.raises(carla_drives.CarlaError, match=r"GB are needed, 0\.0 GB are free"):
         carla_recorder.record(tmp_path, simulator, jobs, SETTINGS)
     assert len(simulator.started) == 1 and recorder.is_complete(tmp_path, JOB.split, JOB.run)
 
@@ -193,24 +237,24 @@ def test_collect_awaits_the_frame_of_every_sensor():
     for frame in (6, 7):
         queues["image"].put(types.SimpleNamespace(frame=frame))
     queues["lidar"].put(types.SimpleNamespace(frame=7))
-    found = carla_recorder.collect(queues, 7, 0.01)
+    found = carla_frames.collect(queues, 7, 0.01)
     assert {name: seen.frame for name, seen in found.items()} == {"image": 7, "lidar": 7}
-    with pytest.raises(carla_recorder.CarlaError, match=r"sensor image stalled: nothing for frame 8 in 0\.01 s"):
-        carla_recorder.collect(queues, 8, 0.01)
+    with pytest.raises(carla_drives.CarlaError, match=r"sensor image stalled: nothing for frame 8 in 0\.01 s"):
+        carla_frames.collect(queues, 8, 0.01)
     queues["image"].put(types.SimpleNamespace(frame=9))
-    with pytest.raises(carla_recorder.CarlaError, match="sensor image sent frame 9 while 8"):
-        carla_recorder.collect(queues, 8, 0.01)
+    with pytest.raises(carla_drives.CarlaError, match="sensor image sent frame 9 while 8"):
+        carla_frames.collect(queues, 8, 0.01)
 
 
 def test_plan_is_the_papers():
-    jobs = carla_recorder.plan()
+    jobs = carla_drives.plan()
     train = [job for job in jobs if job.split == "train"]
     assert len(train) == 100 and sum(job.frames for job in train) == 300_000 and len(jobs) == 140
-    assert {job.weather for job in train} == set(carla_recorder.WEATHERS)
-    assert {job.weather for job in jobs if job.split == "val_ds"} <= set(carla_recorder.SHIFTED_WEATHERS)
+    assert {job.weather for job in train} == set(carla_drives.WEATHERS)
+    assert {job.weather for job in jobs if job.split == "val_ds"} <= set(carla_drives.SHIFTED_WEATHERS)
     assert len({(job.split, job.run) for job in jobs}) == len({job.seed for job in jobs}) == 140
-    assert jobs == carla_recorder.plan() != carla_recorder.plan(seed=1)
-    small = {(job.split, job.run): job for job in carla_recorder.plan(train_runs=2)}
+    assert jobs == carla_drives.plan() != carla_drives.plan(seed=1)
+    small = {(job.split, job.run): job for job in carla_drives.plan(train_runs=2)}
     assert all(job == small.get((job.split, job.run), job) for job in jobs)  # more runs keep those that there are
 
 
@@ -223,7 +267,7 @@ def test_command_line_estimates_without_a_server(tmp_path, capsys):
 
 def test_a_missing_client_names_the_extra_and_a_wrong_agent_the_form(monkeypatch):
     monkeypatch.setitem(sys.modules, "carla", None)
-    with pytest.raises(carla_recorder.CarlaError, match=r"muvo_jax\[carla\]"):
+    with pytest.raises(carla_drives.CarlaError, match=r"muvo_jax\[carla\]"):
         carla_client.Client(SETTINGS)
     for name in ("json", "json:no_such_thing", "no_such_module:f", ":f"):
         with pytest.raises(ValueError, match="--agent="):
@@ -240,9 +284,9 @@ def test_tags_and_poses_agree_with_the_clients_types():
         assert carla_files.LAYOUT_TAGS[tags[name]] == expected, name
     assert all(carla_files.LAYOUT_TAGS[tag] for name, tag in tags.items() if name != "NONE")
     placed = carla.Transform(carla.Location(3, 4, 0), carla.Rotation(yaw=90, pitch=10))
-    assert carla_recorder.pose_of(placed) == pytest.approx((3, -4, -math.pi / 2))
+    assert carla_frames.pose_of(placed) == pytest.approx((3, -4, -math.pi / 2))
     forward = placed.get_forward_vector()
-    assert carla_recorder.forward_speed(placed, forward * 7) == pytest.approx(7, rel=1e-5)
+    assert carla_frames.forward_speed(placed, forward * 7) == pytest.approx(7, rel=1e-5)
     detection = carla.SemanticLidarDetection()
     assert {"point", "cos_inc_angle", "object_idx", "object_tag"} <= set(dir(detection))
 
@@ -250,7 +294,7 @@ def test_tags_and_poses_agree_with_the_clients_types():
 @needs_carla
 def test_every_weather_is_one_of_the_clients_and_no_server_is_one_clear_error():
     import carla
-    for name in {*carla_recorder.WEATHERS, *carla_recorder.SHIFTED_WEATHERS}:
+    for name in {*carla_drives.WEATHERS, *carla_drives.SHIFTED_WEATHERS}:
         assert isinstance(getattr(carla.WeatherParameters, name), carla.WeatherParameters)
-    with pytest.raises(carla_recorder.CarlaError, match=r"CARLA at 127\.0\.0\.1:1: "):
+    with pytest.raises(carla_drives.CarlaError, match=r"CARLA at 127\.0\.0\.1:1: "):
         carla_client.Client(SETTINGS, port=1, timeout_s=0.2)

@@ -12,7 +12,7 @@ import torch_writer
 
 import muvo_jax
 from muvo_jax import config as config_lib
-from muvo_jax import convert, presets
+from muvo_jax import convert, dream, evaluate, presets
 from muvo_jax.interop import checkpoints, export_torch, names, packs, safetensors_file, weights_rule
 from muvo_jax.model import world_model
 from muvo_jax.training import screen
@@ -111,6 +111,19 @@ def test_a_checkpoint_without_tensors_and_an_occupied_folder(tmp_path):
     with pytest.raises(FileExistsError, match="run"):
         run_convert(tmp_path / "a.ckpt", tmp_path / "run")
     assert (tmp_path / "run" / "diary.txt").read_text() == "mine"
+
+
+@pytest.mark.slow
+def test_a_converted_run_is_judged_and_dreams(tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    state_dict = names.reference_state_dict(drawn_variables(TINY), TINY)
+    torch_writer.write_zip(tmp_path / "a.ckpt", checkpoint_of(state_dict))
+    run_convert(tmp_path / "a.ckpt", tmp_path / "run")
+    judged = evaluate.evaluate(evaluate.Options(tmp_path / "run", splits=("val_rl",), windows=1, batch=1),
+                               screen.Screen())
+    assert "val_rl" in json.dumps(judged) and (tmp_path / "run" / "evaluation.json").exists()
+    drawn = dream.dream(dream.Options(tmp_path / "run", context=2, horizon=2), screen.Screen())
+    assert {path.suffix for path in drawn} == {".gif", ".png"} and all(path.stat().st_size for path in drawn)
 
 
 @pytest.mark.slow

@@ -39,7 +39,7 @@ def range_views(context: cases.Context) -> Checks:
     tags = context.draw("rv_sem", (len(cloud),), "ints9").astype(np.uint8)
     winner = range_view.nearest_points(cloud, geometry)
     yield cases.Check("range/sem", np.where(winner >= 0, tags[winner], 0), SHARE_TOLERANCE, _known_apart)
-    depth = 60 * context.draw("restore_depth", (1, 2, rows, columns), "smooth")
+    depth = 60 * context.draw("restore_depth", context.pack.shape("restore_pcd")[:-1], "smooth")
     yield cases.Check("restore_pcd", reference_data.pixel_corner_points(depth, geometry), TOLERANCE)
 
 

@@ -16,6 +16,7 @@ import tyro
 from muvo_jax import command_line, config_json, dream, evaluate, presets
 from muvo_jax import config as config_lib
 from muvo_jax.interop import backbones
+from muvo_jax.metrics import protocol
 from muvo_jax.objectives import perceptual
 from muvo_jax.training import checkpoint, loop, run_folder, screen, start, validation
 from muvo_jax.viz import curves, sheets
@@ -258,13 +259,16 @@ def train(options: Options, show: screen.Screen) -> None:
     config, chosen, folder = configure(options)
     elsewhere = [f"--runs-dir={options.runs_dir}"] if options.runs_dir != pathlib.Path("runs") else []
     resume_command = shlex.join(["python", "-m", "muvo_jax.train", f"--name={folder.name}", "--resume", *elsewhere])
+    visible = not set(protocol.HEADS).isdisjoint(config.model.heads)
     outcome = loop.train(loop.Job(
         config=config, folder=folder, open_recording=lambda: command_line.open_data(config, show), chosen=tuple(chosen),
         resume=options.resume, resume_command=resume_command, started_s=command_line.process_start_s(),
         init=options.init, pretrained=_pretrained(config, options.resume), frozen=frozen_encoder(config),
-        preview=draw_preview), show)
+        preview=draw_preview if visible else None), show)
     draw_curves(folder)
-    if outcome.stopped or not options.evaluate:
+    if not visible:
+        show.line(f"no head of {', '.join(protocol.HEADS)}: there is nothing to draw or to judge.")
+    if outcome.stopped or not options.evaluate or not visible:
         return
     evaluate.evaluate(evaluate.Options(run=folder), show)
     dream.dream(dream.Options(run=folder), show)
@@ -276,6 +280,8 @@ def _pretrained(config: config_lib.Config, resume: bool) -> start.Pretrained | N
     if not path:
         return None
     backbone = None if resume else backbones.read(path)
+    if backbone is not None:
+        backbones.check(backbone, config.model)  # before anything is recorded or compiled
     return lambda variables, model: backbones.load_into(variables, backbone or backbones.read(path), model)
 
 

@@ -7,6 +7,7 @@ import pathlib
 import re
 import subprocess
 import sys
+import types
 
 import pytest
 
@@ -210,3 +211,14 @@ def test_the_whole_job_on_the_smallest_town(tmp_path):
                             cwd=tmp_path, capture_output=True, text=True, check=False,
                             env={**os.environ, "PYTHONPATH": str(ROOT), "XDG_CACHE_HOME": str(tmp_path / "cache")})
     assert readme.stdout.split() == ["(2,", "1,", "32,", "64,", "3)"], readme.stderr
+
+
+@pytest.mark.parametrize("heads, visible", [("action,reward", False), ("image,action", True)])
+def test_a_model_that_predicts_no_sensor_is_neither_drawn_nor_judged(monkeypatch, tmp_path, heads, visible):
+    done = []
+    monkeypatch.setattr(train.loop, "train", lambda job, show: done.append(job) or types.SimpleNamespace(stopped=False))
+    monkeypatch.setattr(train, "draw_curves", lambda folder: None)
+    monkeypatch.setattr(train.evaluate, "evaluate", lambda *_: done.append("judged"))
+    monkeypatch.setattr(train.dream, "dream", lambda *_: done.append("drawn"))
+    train.train(train.Options(preset="tiny", heads=heads, runs_dir=tmp_path), screen.Screen())
+    assert (done[0].preview is not None) is visible and done[1:] == (["judged", "drawn"] if visible else [])

@@ -24,7 +24,7 @@ from muvo_jax.objectives import perceptual
 
 _NETWORKS: dict[str, type[resnet.ResNet18] | type[mobilevit.MobileVit]] = {
     "resnet18": resnet.ResNet18, "mobilevitv2_100": mobilevit.MobileVit}
-_LEVELS = (1, 2, 3, 4)
+_LEVELS, _WIDTH = (1, 2, 3, 4), 64
 _LANDMARKS = {"resnet18": "layer1.0.conv1.weight", "mobilevitv2_100": "stages_1.0.conv1_1x1.conv.weight"}
 _FIRST = {"resnet18": "conv1.weight", "mobilevitv2_100": "stem.conv.weight"}
 _UNUSED = re.compile(r"^(fc|head|classifier|final_conv)\b|num_batches_tracked$")
@@ -66,7 +66,7 @@ def read(path: pathlib.Path | str) -> Backbone:
         raise BackboneError(f"{path}: expected a ResNet-18 or MobileViT-V2 in torchvision's or timm's names (such as "
                             f"{' or '.join(_LANDMARKS.values())}), found {len(tensors)} tensors such as "
                             f"{', '.join(list(tensors)[:4])}.")
-    wanted = {key for key, _, _ in _entries(_shapes(kind, 64, 3))}
+    wanted = {key for key, _, _ in _entries(_shapes(kind))}
     odd = sorted(key for key in tensors if key not in wanted and not _UNUSED.search(key))
     absent = sorted(wanted - tensors.keys())
     if odd or absent:
@@ -74,6 +74,18 @@ def read(path: pathlib.Path | str) -> Backbone:
                             f"{len(absent)} are missing ({', '.join(absent[:4]) or 'none'}), {len(odd)} are strange "
                             f"({', '.join(odd[:4]) or 'none'}).")
     return Backbone(pathlib.Path(path), kind, tensors)
+
+
+def check(backbone: Backbone, config: config_lib.ModelConfig) -> None:
+    """Raises BackboneError where a model's image encoder is another network than the file's, or of another width."""
+    if backbone.kind != config.backbone:
+        raise BackboneError(f"{backbone.path}: holds {backbone.kind}, the model's image encoder is {config.backbone}. "
+                            f"Choose --backbone={backbone.kind}, or another file.")
+    if config.backbone_width != _WIDTH:
+        raise BackboneError(f"{backbone.path}: a network of full width (its {_FIRST[backbone.kind]} is "
+                            f"{list(backbone.tensors[_FIRST[backbone.kind]].shape)}), but the model expected "
+                            f"model.backbone_width={config.backbone_width}. Choose --set model.backbone_width={_WIDTH} "
+                            f"(the presets paper and reference-* have it).")
 
 
 def load_into(variables: Mapping[str, Any], backbone: Backbone,
@@ -86,9 +98,7 @@ def load_into(variables: Mapping[str, Any], backbone: Backbone,
     Raises:
       BackboneError: where the image encoder is another network, or a size differs.
     """
-    if backbone.kind != config.backbone:
-        raise BackboneError(f"{backbone.path}: holds {backbone.kind}, the model's image encoder is {config.backbone}. "
-                            f"Choose --backbone={backbone.kind}, or another file.")
+    check(backbone, config)
     filled, notes = jax.tree.map(np.asarray, {part: dict(tree) for part, tree in variables.items()}), []
     for module, name in _PLACES:
         kind = config.backbone if name == "backbone" and module != "route" else "resnet18"
@@ -106,8 +116,8 @@ def load_into(variables: Mapping[str, Any], backbone: Backbone,
 
 def frozen_encoder(backbone: Backbone) -> perceptual.FrozenEncoder:
     """The network of the perceptual loss from a file: all four levels, as the reference's ResNet-18."""
-    network = _NETWORKS[backbone.kind](64, _LEVELS)
-    return perceptual.FrozenEncoder(network, _filled(backbone, _shapes(backbone.kind, 64, 3), "perceptual network"),
+    network = _NETWORKS[backbone.kind](_WIDTH, _LEVELS)
+    return perceptual.FrozenEncoder(network, _filled(backbone, _shapes(backbone.kind), "the perceptual network"),
                                     f"{backbone.kind} of {backbone.path}")
 
 
@@ -127,10 +137,10 @@ def frozen_encoder_of_run(variables: Mapping[str, Any], config: config_lib.Model
     return perceptual.FrozenEncoder(network, part, f"the image encoder of {source}")
 
 
-def _shapes(kind: str, width: int, channels: int) -> Any:
-    """{"params": ..., "batch_stats": ...} of the whole network."""
-    network = _NETWORKS[kind](width, _LEVELS, layers.Compute(convolution="xla"))
-    return jax.eval_shape(lambda: network.init(jax.random.key(0), jnp.zeros((1, 64, 64, channels)), norm.Mode()))
+def _shapes(kind: str) -> Any:
+    """{"params": ..., "batch_stats": ...} of the whole network at full width, for pictures."""
+    network = _NETWORKS[kind](_WIDTH, _LEVELS, layers.Compute(convolution="xla"))
+    return jax.eval_shape(lambda: network.init(jax.random.key(0), jnp.zeros((1, 64, 64, 3)), norm.Mode()))
 
 
 def _entries(tree: Any) -> Iterator[tuple[str, tuple, Any]]:
@@ -152,8 +162,7 @@ def _filled(backbone: Backbone, shapes: Any, where: str) -> Any:
         if ours.shape != leaf.shape:
             expected = names.reference_shape(path[-1].key, leaf.shape)
             raise BackboneError(f"{backbone.path}: {key} is {list(backbone.tensors[key].shape)}, {where} expected "
-                                f"{list(expected)}. Such weights fit networks of full width: "
-                                f"--set model.backbone_width=64 (the presets paper and reference-* have it).")
+                                f"{list(expected)}. Take the network of ImageNet's size.")
         return np.ascontiguousarray(ours)
 
     leaves = [value(*entry) for entry in _entries(shapes)]

@@ -68,9 +68,14 @@ def test_mobilevit_is_read_in_both_of_timms_spellings(tmp_path):
 
 def test_a_file_that_does_not_fit_is_named_with_what_was_expected_and_found(resnet, resnet_file, tmp_path):
     fresh = world_model.WorldModel(TINY).init(jax.random.key(0))
-    with pytest.raises(backbones.BackboneError, match=r"bn1.running_mean is \[64\], camera/backbone "
-                                                      r"expected \[4\].*backbone_width=64"):
+    with pytest.raises(backbones.BackboneError, match=r"conv1.weight is \[64, 3, 7, 7\]\), but the model "
+                                                      r"expected model.backbone_width=4\. .*backbone_width=64"):
         backbones.load_into(fresh, backbones.read(resnet_file), TINY)
+    short = resnet | {"layer2.0.conv1.weight": resnet["layer2.0.conv1.weight"][:64]}
+    safetensors_file.save(tmp_path / "short.safetensors", short)
+    with pytest.raises(backbones.BackboneError, match=r"short.*layer2.0.conv1.weight is \[64, 64, 3, 3\], the "
+                                                      r"perceptual network expected \[128, 64, 3, 3\]"):
+        backbones.frozen_encoder(backbones.read(tmp_path / "short.safetensors"))
     deeper, other = tmp_path / "resnet34.safetensors", tmp_path / "alexnet.safetensors"
     safetensors_file.save(deeper, resnet | {"layer1.2.conv1.weight": resnet["layer1.0.conv1.weight"]})
     with pytest.raises(backbones.BackboneError, match=r"resnet34.*1 are strange \(layer1.2.conv1.weight\)"):

@@ -17,7 +17,7 @@ from muvo_jax import types
 from muvo_jax.interop import reference_losses
 from muvo_jax.interop import reference_preprocess as preprocess
 from muvo_jax.interop.parity import cases, losses, raw_batch
-from muvo_jax.objectives import kl, regression, scal
+from muvo_jax.objectives import instances, kl, regression, scal
 
 Checks = Iterator[cases.Check]
 Terms = Iterator[tuple[str, Any]]
@@ -120,11 +120,10 @@ def _true(mask: np.ndarray) -> jax.Array:
 
 def _instances(output, labels: dict[str, np.ndarray], scale: int) -> Terms:
     """Centres of instances, and the way to them, which only counts on an instance and not less at a smaller scale."""
-    centre = regression.l2_sums(_last(output("bev_instance_center")), _last(labels[f"center_label_{scale}"]))
+    numbers = jnp.asarray(np.asarray(labels[f"instance_label_{scale}"], np.int32)[:, :, 0])
+    centre, away = instances.sums(_last(output("bev_instance_center")), _last(output("bev_instance_offset")), numbers,
+                                  scale)
     yield "bev_center", _MAP_WEIGHT / scale * _CENTRE_WEIGHT * centre.value()
-    offset = labels[f"offset_label_{scale}"]
-    away = regression.l1_sums(_last(output("bev_instance_offset")), _last(offset),
-                              _true(offset[:, :, :1] != preprocess.IGNORED))
     yield "bev_offset", _MAP_WEIGHT * _OFFSET_WEIGHT * away.value()
 
 

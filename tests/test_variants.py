@@ -36,7 +36,7 @@ def town(tmp_path_factory):
 
 @pytest.fixture(scope="module", autouse=True)
 def fast_compilation():
-    before = jax.config.jax_disable_most_optimizations
+    before = jax.config.read("jax_disable_most_optimizations")
     jax.config.update("jax_disable_most_optimizations", True)
     yield
     jax.config.update("jax_disable_most_optimizations", before)

@@ -2,28 +2,36 @@
 
     python experiments/speed/data.py [--recording=FOLDER] [--output=experiments/speed/data.md]
 
-Times are processor seconds of one thread, the least of several tries, so that a busy machine disturbs them little.
+FOLDER is packed, such as one of the town at its default size; enlarged, its pictures make a folder of the paper's size.
+Times are processor seconds of one thread, the least of several tries, so that a busy machine disturbs them little;
+windows a second are by the clock.
 """
 
 from __future__ import annotations
 
 import argparse
 import math
+import multiprocessing
 import pathlib
+import resource
 import tempfile
 import time
+import types
 from collections.abc import Callable
 
 import data_baselines
 import numpy as np
+from PIL import Image
 
 from muvo_jax import config as config_lib
-from muvo_jax.data import records, schema, shards, sources
+from muvo_jax import presets
+from muvo_jax.data import pipeline, prepare, recorder, records, schema, shards, sources
 from muvo_jax.interop.weights_rule import make_input
 from muvo_jax.ops import camera, range_view, voxels
 
 ROAD_LINE = 6
 FRAMES = 64
+WINDOWS = 30
 
 
 def seconds(work: Callable[[], object], tries: int = 5) -> float:
@@ -91,6 +99,71 @@ def packing(recording: schema.Recording) -> list[str]:
             f"Reading: {count / reading_s:.0f} from the folder, {count / decode_s:.0f} from shards."]
 
 
+def peak_mib(folder: pathlib.Path, frames: int) -> float:
+    """Peak memory of a process of its own that packs so many frames (the recording again and again)."""
+    recording = sources.open_recording(folder)
+    length = sum(sequence.length for sequence in recording.sequences)
+    longer = types.SimpleNamespace(sequences=recording.sequences * math.ceil(frames / length), read=recording.read)
+    with tempfile.TemporaryDirectory() as out:
+        numbers = list(range(frames // shards.FRAMES_PER_SHARD))
+        for _ in shards.write_shards(longer, pathlib.Path(out), numbers, shards.FRAMES_PER_SHARD, records.Encoding()):
+            pass
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+
+
+def packing_memory(folder: pathlib.Path) -> str:
+    lengths = (2 * shards.FRAMES_PER_SHARD, 10 * shards.FRAMES_PER_SHARD)
+    with multiprocessing.get_context("spawn").Pool(1, maxtasksperchild=1) as pool:
+        peaks = [pool.apply(peak_mib, (folder, frames)) for frames in lengths]
+    return "Peak memory of packing: " + ", ".join(f"{peak:.0f} MiB for {frames} frames" for peak, frames in
+                                                  zip(peaks, lengths, strict=True)) + "."
+
+
+def write_paper_size(recording: schema.Recording, folder: pathlib.Path) -> schema.Recording:
+    """A plain recording of 960x600 pixels (enlarged, with grain), 60 000 points and the paper's voxels."""
+    grid, lidar = config_lib.VoxelGrid(), config_lib.RangeViewGeometry()
+    intrinsics = camera.intrinsics_from_fov(960, 600, math.radians(110))
+    pinhole = schema.Camera(960, 600, tuple(map(tuple, intrinsics.tolist())),
+                            tuple(map(tuple, camera.level_camera_to_ego(lidar.position_m).tolist())))
+    recorder.write_description(folder, name="large", rate_hz=10.0, splits=("train",), camera=pinhole, lidar=lidar,
+                               voxels=grid, contract=recording.description.contract)
+    writer, rng = recorder.RunWriter(folder, "train", "run"), np.random.default_rng(0)
+    points_m = make_input("rv_cloud", (60000,), "cloud").astype(np.float32)
+    occupancy = voxels.occupancy_target(points_m, np.array(lidar.position_m, np.float32), grid)
+    for index in range(FRAMES):
+        small = Image.fromarray(recording.read(recording.sequences[0], index % recording.sequences[0].length)["image"])
+        image = np.asarray(small.resize((960, 600), Image.Resampling.BILINEAR)).astype(np.int16)
+        image = np.clip(image + rng.integers(-2, 3, image.shape), 0, 255).astype(np.uint8)
+        writer.write({"frame_id": index, "timestamp_s": index / 10, "x_m": 0.0, "y_m": 0.0, "yaw_rad": 0.0,
+                      "speed_mps": 5.0, "acceleration": 0.0, "steering": 0.0, "reward": 1.0, "is_terminal": False,
+                      "weather": "", "image": image, "points_m": points_m, "occupancy": occupancy,
+                      "route_map": np.zeros((64, 64), np.uint8)})
+    writer.close()
+    return sources.open_recording(folder)
+
+
+def windows_from_folder(recording: schema.Recording) -> str:
+    """Training windows of 6 frames at the paper's size by the clock, and where a frame's processor time goes."""
+    chosen = {"data.cache_gib": 0.0, "data.frames": 6, "data.context": 2, "data.horizon": 2, "data.stride": 1}
+    wanted = config_lib.override_all(presets.get("paper-occupancy"), chosen)
+    config = prepare.adapt(wanted, recording, keep=chosen).config
+    frames = pipeline.Frames(recording, config)
+    batches = pipeline.train_batches(frames, seed=0, batch=1)
+    for _ in range(2 * pipeline.default_workers() + 4):  # what was read ahead
+        next(batches)
+    start_s = time.perf_counter()
+    for _ in range(WINDOWS):
+        next(batches)
+    rate = WINDOWS / (time.perf_counter() - start_s)
+    sequence = recording.sequences[0]
+    raw = recording.read(sequence, 0)
+    reading_s = seconds(lambda: recording.read(sequence, 0))
+    preparing_s = seconds(lambda: prepare.prepare_frame(raw, config))
+    return (f"From folders of {raw['image'].shape[1]}x{raw['image'].shape[0]} pixels: {rate:.1f} windows of "
+            f"{config.data.frames} frames a second with {pipeline.default_workers()} threads. Processor time of a "
+            f"frame: reading {1e3 * reading_s:.1f} ms, scaling and projecting {1e3 * preparing_s:.1f} ms.")
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--recording", type=pathlib.Path)
@@ -99,6 +172,10 @@ def main() -> None:
     lines = ["| what | plain | here | ratio |", "|---|---|---|---|", projection(), voxelisation()]
     if options.recording is not None:
         lines += packing(sources.open_recording(options.recording))
+        lines += ["", packing_memory(options.recording)]
+        with tempfile.TemporaryDirectory() as folder:
+            large = write_paper_size(sources.open_recording(options.recording), pathlib.Path(folder))
+            lines += ["", windows_from_folder(large)]
     print("\n".join(lines))
     if options.output is not None:
         options.output.write_text("\n".join(lines) + "\n", encoding="utf-8")

@@ -39,8 +39,9 @@ def stream(work: Callable[..., Iterable], shares: Sequence[tuple], doing: str) -
             if fault is not None:
                 raise RuntimeError(f"a {doing} process failed: {fault}")
             yield value
-    except EOFError:
-        pass
+    except EOFError:  # all is told; on a busy machine the workers may take a while to leave
+        for process in processes:
+            process.join()
     finally:
         for process in processes:
             if process.is_alive() and process.exitcode is None:

@@ -51,22 +51,24 @@ def voxel_table(points_m: np.ndarray, tags: np.ndarray, grid: config_lib.VoxelGr
       ValueError: for another shape or for points that are not finite.
     """
     points_m = np.asarray(points_m)
-    range_view.check_points(points_m)
-    if np.shape(tags) != points_m.shape[:1]:
-        raise ValueError(f"tags: got shape {np.shape(tags)}, expected one for each of {len(points_m)} points.")
-    number = np.empty(len(points_m), np.intp)
-    to_corner = np.empty(len(points_m))
+    if points_m.ndim != 2 or points_m.shape[1] != 3:
+        range_view.check_points(points_m)  # raises
+    tags = np.asarray(tags)
+    if tags.shape != points_m.shape[:1]:
+        raise ValueError(f"tags: got shape {tags.shape}, expected one for each of {len(points_m)} points.")
+    nearest = range_view.NearestOfCells(int(np.prod(grid.shape)))
+    has_winning = np.zeros(len(nearest.winner) + 1, bool)  # the last place is of the points outside
     for start in range(0, len(points_m), range_view.BLOCK_POINTS):
         block = slice(start, start + range_view.BLOCK_POINTS)
-        number[block], to_corner[block] = _number_and_distance(points_m[block], grid)
-    winner = range_view.nearest_of_cells(number, to_corner, int(np.prod(grid.shape)))
-    voxel = np.flatnonzero(winner >= 0)
-    tag = np.asarray(tags)[winner[voxel]].astype(np.uint16)
-    if winning_tag is not None:
-        has_winning = np.zeros(len(winner), bool)
-        numbers = number[tags == winning_tag]
-        has_winning[numbers[numbers >= 0]] = True
-        tag[has_winning[voxel]] = winning_tag
+        number, to_corner = _number_and_distance(points_m[block], grid)
+        if not np.isfinite(to_corner).all():
+            range_view.check_points(points_m)  # says which points are not finite
+        nearest.add(number, to_corner, start)
+        if winning_tag is not None:
+            has_winning[number[tags[block] == winning_tag]] = True
+    voxel = np.flatnonzero(nearest.winner >= 0)
+    tag = tags[nearest.winner[voxel]].astype(np.uint16)
+    tag[has_winning[voxel]] = 0 if winning_tag is None else winning_tag
     columns, rows, _ = grid.shape
     plane, ix = np.divmod(voxel.astype(np.int32), np.int32(columns))
     iz, iy = np.divmod(plane, np.int32(rows))
@@ -146,20 +148,26 @@ def voxel_centres(grid: config_lib.VoxelGrid) -> np.ndarray:
 
 
 def _number_and_distance(points_m: np.ndarray, grid: config_lib.VoxelGrid) -> tuple[np.ndarray, np.ndarray]:
-    """Column-major number of the voxel around each point, -1 outside, and the squared distance to its lower corner."""
-    number = np.zeros(len(points_m), np.int32)
+    """Column-major number of the voxel around each point, -1 outside, and the squared distance to its lower corner.
+
+    The distance of a point that is not finite is NaN.
+    """
+    number = np.zeros(len(points_m))  # whole, but as floats: far coordinates would overflow
     inside = np.ones(len(points_m), bool)
     to_corner = np.zeros(len(points_m))  # in voxels
     for axis in (2, 1, 0):
-        place = (points_m[:, axis] - np.float64(grid.origin_m[axis])) / grid.voxel_size_m
+        place = points_m[:, axis] - np.float64(grid.origin_m[axis])
+        place /= grid.voxel_size_m
         index = np.floor(place)
         inside &= (index >= 0) & (index < grid.shape[axis])
-        place -= index
-        to_corner += place * place
-        # Far coordinates would overflow; what is outside is masked in the end.
-        number = number * np.int32(grid.shape[axis]) + np.clip(index, 0, grid.shape[axis]).astype(np.int32)
+        with np.errstate(invalid="ignore"):
+            place -= index
+        place *= place
+        to_corner += place
+        number *= grid.shape[axis]
+        number += index
     number[~inside] = -1
-    return number, to_corner
+    return number.astype(np.intp), to_corner
 
 
 def _strided(origins_m: np.ndarray, stride: int) -> np.ndarray:

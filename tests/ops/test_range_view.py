@@ -115,7 +115,7 @@ def test_many_points_in_one_pixel():
 
 @settings(max_examples=30, deadline=None)
 @given(st.integers(0, 2**31), st.integers(1, 400), st.integers(1, 20))
-def test_nearest_of_cells_is_the_last_of_the_nearest(seed, count, cells):
+def test_the_nearest_of_a_cell_is_the_last_of_the_nearest(seed, count, cells):
     rng = np.random.default_rng(seed)
     cell, distance = rng.integers(-1, cells, count), rng.integers(0, 30, count).astype(np.float64)
     expected = np.full(cells, -1)
@@ -123,4 +123,8 @@ def test_nearest_of_cells_is_the_last_of_the_nearest(seed, count, cells):
         best = expected[cell[point]]
         if cell[point] >= 0 and (best < 0 or distance[point] <= distance[best]):
             expected[cell[point]] = point
-    np.testing.assert_array_equal(range_view.nearest_of_cells(cell, distance, cells), expected)
+    nearest, half = range_view.NearestOfCells(cells), count // 2
+    nearest.add(cell[:half], distance[:half])
+    nearest.add(cell[half:], distance[half:], half)
+    np.testing.assert_array_equal(nearest.winner, expected)
+    np.testing.assert_array_equal(nearest.least, np.where(expected < 0, np.inf, distance[expected]))

@@ -52,10 +52,21 @@ def rounded_anew(variables: Any, tries: int = 32, size: float = 1e-7) -> Iterato
 
     The noise of the packs was measured with 1e-7; what a deep network makes of its own rounding is about 1e-6.
     """
-    for seed in range(tries):
-        normal = np.random.default_rng(seed).standard_normal
-        move = lambda leaf, normal=normal: np.asarray(leaf * (1.0 + size * normal(leaf.shape)), np.float32)
-        yield jax.tree.map(move, variables)
+    return (_moved(variables, seed, size) for seed in range(tries))
+
+
+def rounded_in_pairs(variables: Any, pairs: int = 8, size: float = 1e-5) -> Iterator[Any]:
+    """The variables moved by 1 + size N(0, 1) and by 1 - size N(0, 1), in turns.
+
+    In the mean of what a smooth function makes of a pair the move itself is gone, to 1e-10; what is left are two
+    roundings that know nothing of each other, because the move is much larger than they are.
+    """
+    return (_moved(variables, seed, signed) for seed in range(pairs) for signed in (size, -size))
+
+
+def _moved(variables: Any, seed: int, size: float) -> Any:
+    normal = np.random.default_rng(seed).standard_normal
+    return jax.tree.map(lambda leaf: np.asarray(leaf * (1.0 + size * normal(leaf.shape)), np.float32), variables)
 
 
 def run(module, *args, prefix: str = "", where: str = "", rename: Callable[[str], str] | None = None,

@@ -71,6 +71,8 @@ class ModelConfig:
       deterministic_channels, stochastic_channels, action_channels: the recurrent state-space model of the 1D latent.
       transition_layers: of the transformers that are prior and posterior of the 2D latent, whose tokens have
         token_channels; heads, hidden channels and dropout are those of transformer_*.
+      aligned_tokens: each token of the 2D latent starts from its own last value and what the observation has in its
+        place (model/tokens.py); otherwise from a learned query alone, as in the paper.
       prior_dropout: probability that a training step goes on from the prior sample.
       decoder_channels: width of the image and range-view decoders (512: 512, 512, 512, 512, 256, 128, 64).
       occupancy_channels, occupancy_blocks: width of the voxel decoder and number of its full-width stages; its
@@ -117,6 +119,7 @@ class ModelConfig:
     stochastic_channels: int = 512
     action_channels: int = 64
     transition_layers: int = 6
+    aligned_tokens: bool = False
     prior_dropout: float = 0.15
     decoder_channels: int = 512
     occupancy_channels: int = 64

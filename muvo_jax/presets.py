@@ -13,14 +13,16 @@ def town() -> config_lib.Config:
     """The default: a world model small enough to learn the built-in town on two CPU cores in minutes.
 
     A few hundred updates are too few for the paper's recipe. Decoders start from the average training frame and draw
-    lidar points along their beams, so that the latent has to say only what is special about a frame; fusion keeps the
-    few cells of the small maps apart. A training window shows three frames and asks for five more, imagined as in
+    lidar points along their beams, so that the latent has to say only what is special about a frame; each token of the
+    2D latent starts from what the observation has in its place, and fusion into a vector keeps the few cells of the
+    small maps apart. A training window shows three frames and asks for five more, imagined as in
     evaluation; one of the eight is decoded, so that a batch shows twelve places and weathers, which BatchNorm needs.
     Image, range, points and the cross-entropy of occupancy weigh more than in the paper, where action and KL
     divergence speak loudest, and the affinity losses less: alone they call a voxel occupied that is so in a third of
     the frames.
     """
     model = config_lib.ModelConfig(
+        latent="2d",
         image_size=(64, 256),
         range_view=config_lib.RangeViewGeometry(rows=64, columns=128),
         voxels=config_lib.VoxelGrid(shape=(48, 48, 8), voxel_size_m=1.0, origin_m=(-24.0, -24.0, -1.5)),
@@ -41,6 +43,7 @@ def town() -> config_lib.Config:
         stochastic_channels=128,
         decoder_channels=64,
         transition_layers=1,
+        aligned_tokens=True,
         occupancy_channels=32,
         occupancy_blocks=0,
         occupancy_token_stages=0,

@@ -51,7 +51,7 @@ class Options:
     fusion: Annotated[str | None, command_line.shown("{tr,fc,avg}")] = None
     """How camera and lidar are fused: tr (transformer), fc (concatenation and a dense layer), avg (mean)."""
     latent: Annotated[str | None, command_line.shown("{1d,2d}")] = None
-    """The latent state: 1d (vectors) or 2d (tokens, only with fusion tr)."""
+    """The latent state: 1d (vectors) or 2d (tokens, only with fusion tr; the town preset's there)."""
     backbone: Annotated[str | None, command_line.shown("{resnet18,mobilevitv2_100}")] = None
     """Of image and range view."""
     heads: Annotated[str | None, command_line.shown("NAME,...")] = None

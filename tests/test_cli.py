@@ -150,6 +150,14 @@ def test_variant_flags_choose_encoders_fusion_latent_and_heads():
     assert (model.variant, model.latent) == ("RV-WOB-AVG", "1d")
 
 
+@pytest.mark.parametrize(("options", "latent"), [
+    (train.Options(), "2d"), (train.Options(fusion="tr"), "2d"), (train.Options(lidar="pp"), "2d"),
+    (train.Options(fusion="tr", latent="1d"), "1d"), (train.Options(fusion="fc"), "1d"),
+    (train.Options(variant="PP-BEV-AVG"), "1d"), (train.Options(preset="reference-1d", fusion="tr"), "1d")])
+def test_the_town_has_the_2d_latent_where_fusion_keeps_tokens(options, latent):
+    assert train.configure(options)[0].model.latent == latent
+
+
 def test_resume_takes_the_settings_of_the_run_and_refuses_another_preset(tmp_path):
     stored = config_lib.override(presets.tiny(), "train.seed", 5)
     run_folder.create(tmp_path / "r", stored, "")

@@ -43,7 +43,7 @@ def test_override_changes_one_field_and_leaves_the_rest():
 ])
 def test_bad_values_are_refused_with_the_reason(field, value, message):
     town = config_lib.override_all(presets.get("town"), {
-        "model.lidar": "pp", "model.camera": "bev", "model.backbone": "mobilevitv2_100"})
+        "model.latent": "1d", "model.lidar": "pp", "model.camera": "bev", "model.backbone": "mobilevitv2_100"})
     with pytest.raises(ValueError, match=message):
         config_lib.override(town, field, value)
 

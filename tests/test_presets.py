@@ -16,8 +16,8 @@ _ENCODER_TEMPLATE, _DECODER_TEMPLATE = 2_168_192, 2_760_320
 _PUBLISHED = {"reference-1d": 176_185_437 - _ENCODER_TEMPLATE,
               "reference-2d": 119_079_973 - _ENCODER_TEMPLATE - 2 * _DECODER_TEMPLATE,
               "reference-mobilevit": 113_533_012 - _ENCODER_TEMPLATE - 2 * _DECODER_TEMPLATE}
-_VARIANTS = [dict(zip(("lidar", "camera", "fusion"), parts, strict=True)) for parts in itertools.product(
-    config_lib.LIDAR_ENCODERS, config_lib.CAMERA_ENCODERS, config_lib.FUSIONS)]
+_VARIANTS = [dict(zip(("lidar", "camera", "fusion", "latent"), (*parts, "1d"), strict=True))
+             for parts in itertools.product(config_lib.LIDAR_ENCODERS, config_lib.CAMERA_ENCODERS, config_lib.FUSIONS)]
 
 
 def parameters(config):

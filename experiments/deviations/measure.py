@@ -36,7 +36,7 @@ def leaky_slope() -> tuple[str, str]:
     """Mean absolute size of imagined deterministic states after six steps, with the same fresh weights."""
     sizes = []
     for numerics in ("standard", "reference"):
-        config = dataclasses.replace(presets.get("town").model, numerics=numerics)
+        config = dataclasses.replace(presets.get("town").model, latent="1d", numerics=numerics)
         model = world_model.WorldModel(config)
         variables = model.init(jax.random.key(0))
         dream = rollout.imagine(model, variables, jax.random.key(1), model.initial_state(8), jnp.ones((8, 6, 2)))

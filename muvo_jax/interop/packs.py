@@ -52,6 +52,14 @@ class Pack:
     def shape(self, name: str) -> tuple[int, ...]:
         return self.arrays[name].shape if name in self.arrays else tuple(self.arrays[name + "::meta"][1:].tolist())
 
+    def stride(self, name: str) -> int:
+        """Every how many values of the flattened array one is stored."""
+        return 1 if name in self.arrays else int(self.arrays[name + "::meta"][0])
+
+    def values(self, name: str) -> np.ndarray:
+        """The stored values: the whole array, or every `stride`-th of the flattened one."""
+        return self.arrays[name if name in self.arrays else name + "::sub"]
+
     def error(self, name: str, got: Any) -> float:
         """Largest difference over the stored values, divided by the largest magnitude among them (at least 1e-6).
 
@@ -91,12 +99,11 @@ class Pack:
             raise ValueError(f"{name}: got shape {list(got.shape)}, expected {list(self.shape(name))}.")
         if name in self.arrays:
             return self.arrays[name], got, 0.0
-        stride = int(self.arrays[name + "::meta"][0])
         _, std, _, _, norm = self.arrays[name + "::stats"]
         wide = got.astype(np.float64)
         extra = max(abs(wide.std() - std) / max(std, 1e-6),
                     abs(np.sqrt(np.square(wide).sum()) - norm) / max(norm, 1e-6))
-        return self.arrays[name + "::sub"], got.reshape(-1)[::stride], float(extra)
+        return self.values(name), got.reshape(-1)[::self.stride(name)], float(extra)
 
 
 class Settings:

@@ -5,7 +5,8 @@ also see a gated mean of all tokens. Prior and posterior are transformer decoder
 of the state, look at the tokens of h', of the action and, for the posterior, of the observation.
 
 Differs from the reference where the posterior looks at h' without the type embedding that marks it in the prior: an
-omission there, kept by numerics="reference".
+omission there, kept by numerics="reference". With `model.aligned_tokens` a query starts from the token's own h' and, in
+the posterior, from what the observation has in its place, which attention need not find first.
 """
 
 from __future__ import annotations
@@ -48,12 +49,16 @@ class TokenGRU(linen.Module):
 
 
 class TokenGaussianHead(linen.Module):
-    """Memory [B, M, C] -> Gaussian [B, N, C]: one learned query per token of the state, decoded over the memory."""
+    """Memory [B, M, C] -> Gaussian [B, N, C]: one learned query per token of the state, decoded over the memory.
+
+    With `start` [B, N, C] the query is what is learned of a token beside that.
+    """
 
     config: ModelConfig
 
     @linen.compact
-    def __call__(self, memory: jax.Array, keys: jax.Array | None, first_site: int) -> Gaussian:
+    def __call__(self, memory: jax.Array, keys: jax.Array | None, first_site: int,
+                 start: jax.Array | None = None) -> Gaussian:
         config, compute = self.config, common.compute(self.config)
         channels, groups = config.token_channels, tokens.groups(config)
         type_embedding = self.param("type_embedding", layers.shape_only, (len(groups), channels))
@@ -65,6 +70,8 @@ class TokenGaussianHead(linen.Module):
             queries.append(query + type_embedding[index][None])
         x = jnp.concatenate(queries).astype(compute.dtype)
         x = jnp.broadcast_to(x[None], (memory.shape[0], *x.shape))
+        if start is not None:
+            x = x + start.astype(x.dtype)
         x = attention.TransformerDecoder(
             config.transition_layers, config.transformer_heads, config.transformer_hidden_channels, config.dropout,
             compute, name="transformer")(x, memory.astype(compute.dtype), keys, first_site)
@@ -82,6 +89,9 @@ class TokenTransition(filtering.Transition):
         self.gru = TokenGRU(config.token_channels, compute)
         self.prior_action, self.posterior_action = (layers.Dense(config.token_channels, compute) for _ in range(2))
         self.prior, self.posterior = TokenGaussianHead(config), TokenGaussianHead(config)
+        if config.aligned_tokens:
+            self.prior_own, self.posterior_own, self.posterior_seen = (
+                layers.Dense(config.token_channels, compute) for _ in range(3))
 
     @staticmethod
     def state_shapes(config: ModelConfig) -> tuple[tuple[int, ...], tuple[int, ...]]:
@@ -98,14 +108,20 @@ class TokenTransition(filtering.Transition):
 
     def predict(self, deterministic: jax.Array, action: jax.Array, keys: jax.Array | None) -> Gaussian:
         memory = jnp.concatenate([self._typed(deterministic, 1), self._action(self.prior_action, action)], axis=-2)
-        return self.prior(memory, keys, 0)
+        start = self.prior_own(deterministic) if self.config.aligned_tokens else None
+        return self.prior(memory, keys, 0, start)
 
     def infer(self, deterministic: jax.Array, embedding: jax.Array, action: jax.Array,
               keys: jax.Array | None) -> Gaussian:
         remembered = deterministic if self.config.numerics == "reference" else self._typed(deterministic, 1)
         memory = jnp.concatenate([remembered, self._typed(embedding, 0), self._action(self.posterior_action, action)],
                                  axis=-2)
-        return self.posterior(memory, keys, attention.SITES_PER_DECODER_LAYER * self.config.transition_layers)
+        start = None
+        if self.config.aligned_tokens:
+            seen = tokens.of_observation(self.posterior_seen(embedding), self.config)
+            start = self.posterior_own(deterministic) + seen
+        sites = attention.SITES_PER_DECODER_LAYER * self.config.transition_layers
+        return self.posterior(memory, keys, sites, start)
 
     def _typed(self, values: jax.Array, kind: int) -> jax.Array:
         """Marks tokens [B, n, C] as those of the observation (0), of the state (1) or of the action (2)."""

@@ -57,3 +57,21 @@ def read(features: jax.Array, group: str, config: ModelConfig) -> jax.Array:
 def pool(features: jax.Array, config: ModelConfig) -> jax.Array:
     """[..., N, 2 C] -> [..., G * 2 C]: the mean of each group's tokens side by side, the action's token last."""
     return jnp.concatenate([part.mean(axis=-2) for part in split(features, config).values()], axis=-1)
+
+
+def of_observation(embedding: jax.Array, config: ModelConfig) -> jax.Array:
+    """An observation's tokens [..., M, C] in the places of the state's tokens: [..., N, C].
+
+    The image's cells go to the group "image" with camera "wob", the range view's to "range_view" with lidar "rv": those
+    have the same grids, unless there are many tokens. What has no counterpart gets the mean of the whole observation.
+    """
+    sizes = {group: math.prod(grid) for group, grid in groups(config).items()}
+    lidar_ends = embedding.shape[-2] - (config.route + 3 * config.navigation + config.speed)
+    placed = {}
+    if config.camera == "wob" and not config.many_tokens:
+        placed["image"] = embedding[..., :sizes["image"], :]
+    if config.lidar == "rv" and not config.many_tokens:
+        placed["range_view"] = embedding[..., lidar_ends - sizes["range_view"]:lidar_ends, :]
+    whole = embedding.mean(axis=-2, keepdims=True)
+    spread = lambda size: jnp.broadcast_to(whole, (*whole.shape[:-2], size, whole.shape[-1]))
+    return jnp.concatenate([placed.get(group, spread(size)) for group, size in sizes.items()], axis=-2)

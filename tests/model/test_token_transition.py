@@ -63,6 +63,35 @@ def test_heads_read_their_own_tokens_and_the_reference_s_alone():
     np.testing.assert_allclose(pooled[-24:], features[18])
 
 
+def test_the_cells_of_a_sensor_keep_their_places():
+    embedding = jnp.arange(1.0, 7 * 12 + 1).reshape(1, 7, 12)  # 2 cells of the image, 3 of a lidar, route, speed
+    image_alone = tokens.of_observation(embedding, dataclasses.replace(CONFIG, lidar="pp"))
+    assert image_alone.shape == (1, 19, 12)
+    np.testing.assert_array_equal(image_alone[:, :2], embedding[:, :2])
+    assert not image_alone[:, 2:].any()
+    embedding = jnp.arange(1.0, 13 * 12 + 1).reshape(1, 13, 12)  # 3 of a bird's-eye view, 8 of the range view, 2 measured
+    lidar_alone = tokens.of_observation(embedding, dataclasses.replace(CONFIG, camera="bev"))
+    np.testing.assert_array_equal(lidar_alone[:, 2:10], embedding[:, 3:11])
+    assert not lidar_alone[:, :2].any() and not lidar_alone[:, 10:].any()
+    assert not tokens.of_observation(embedding, dataclasses.replace(CONFIG, many_tokens=True)).any()
+
+
+def test_aligned_tokens_start_where_they_stand():
+    model = world_model.WorldModel(dataclasses.replace(CONFIG, aligned_tokens=True))
+    variables = jax.tree.map(jnp.asarray, model.init(jax.random.key(0)))
+    cells = tokens.count(CONFIG) - 8 - 1  # of image and range view, which the observation has too
+    window = make_window(BATCH, FRAMES, (cells + 2, CONFIG.token_channels), SHAPE)
+    aligned = jax.jit(lambda variables: rollout.filter_embeddings(model, variables, *window))
+    of_queries = jax.jit(lambda variables: rollout.filter_embeddings(MODEL, variables, *window))
+    transition = variables["params"]["transition"]
+    silent = {name: jax.tree.map(jnp.zeros_like, part) if name.endswith(("_own", "_seen")) else part
+              for name, part in transition.items()}
+    silenced = variables | {"params": variables["params"] | {"transition": silent}}
+    assert_close(aligned(silenced).posterior.mean, of_queries(variables).posterior.mean)
+    moved = jnp.abs(aligned(variables).posterior.mean - of_queries(variables).posterior.mean).max(axis=(0, 1, 3))
+    assert (moved > 1e-3).all()
+
+
 def test_gru_by_hand():
     sigmoid = lambda value: 1 / (1 + np.exp(-value))
     random = np.random.default_rng(0)

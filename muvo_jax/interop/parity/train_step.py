@@ -7,7 +7,7 @@ with which the reference really trains are entries of their own.
 from __future__ import annotations
 
 import dataclasses
-import math
+import functools
 from collections.abc import Iterator
 from typing import Any
 
@@ -27,7 +27,8 @@ from muvo_jax.training import optimizer as optimizer_lib
 Checks = Iterator[cases.Check]
 LOSS_TOLERANCE, STATISTICS_TOLERANCE, NORM_TOLERANCE, NEW_TOLERANCE = 1e-4, 1e-5, 5e-3, 1e-5
 STYLED_TOLERANCE, SCHEDULE_TOLERANCE = 5e-4, 1e-6
-_RATE, _CLEAR_SHARE = 1e-4, 1e-3
+_RATE, _EPSILON = 1e-4, 1e-8
+_DECISIVE = 1e3  # gradients this many times epsilon move a parameter by the whole rate
 _NOISY = ("encoder.", "range_view_encoder.", "feat_decoder.")
 _TERMS = {"image": "rgb", "range_xyz": "lidar_re", "range_depth": "lidar_depth", "occupancy_cross_entropy": "voxel",
           "occupancy_semantic_scal": "sem_scal", "occupancy_geometric_scal": "geo_scal", "kl": "probabilistic"}
@@ -146,7 +147,7 @@ def _gradients(context: cases.Context, gradients: Any) -> Checks:
 
 def _update(context: cases.Context, params: Any, gradients: Any) -> Checks:
     """One AdamW step with the reference's two groups; weight decay spares parameters with one axis."""
-    adamw = optax.adamw(_RATE, b1=0.9, b2=0.999, eps=1e-8, weight_decay=0.01,
+    adamw = optax.adamw(_RATE, b1=0.9, b2=0.999, eps=_EPSILON, weight_decay=0.01,
                         mask={"decayed": True, "undecayed": False})
 
     @jax.jit
@@ -155,29 +156,31 @@ def _update(context: cases.Context, params: Any, gradients: Any) -> Checks:
         updates, _ = adamw.update(optimizer_lib.pack(gradients), adamw.init(packed), packed)
         return optimizer_lib.unpack(updates, params)
 
-    moved = dict(_by_reference_key({"params": update(params, gradients)}))
+    signed = jax.tree_util.tree_map_with_path(functools.partial(_signed, context.pack), gradients)
+    moved = dict(_by_reference_key({"params": update(params, signed)}))
     for key, before in _by_reference_key({"params": params}):
         if f"new/{key}" in context.pack:
             delta = moved[key].reshape(context.pack.shape(f"delta/{key}"))
-            yield cases.Check(f"new/{key}", before.reshape(delta.shape) + delta, NEW_TOLERANCE, _step_error)
-            yield cases.Check(f"delta/{key}", delta, gradient_tolerance(key), _step_error)
+            yield cases.Check(f"new/{key}", before.reshape(delta.shape) + delta, NEW_TOLERANCE)
+            yield cases.Check(f"delta/{key}", delta, gradient_tolerance(key))
 
 
-def _step_error(pack: packs.Pack, entry: str, got: np.ndarray) -> float:
-    """The error where the gradient is more than noise; infinite where a parameter moved further than it can.
+def _signed(pack: packs.Pack, path: tuple[Any, ...], gradient: jax.Array) -> np.ndarray:
+    """A gradient of ours with the pack's in the places where ours does not decide the step.
 
-    The first step of Adam is as long as the learning rate whatever the size of the gradient, so where that is noise
-    the step may go either way: below a thousandth of the largest gradient, as the page of the pack says. The length of
-    the step is compared where the gradient is also above its own tolerance.
+    Adam's first step is gradient / (|gradient| + epsilon), as long as the learning rate whatever the gradient's size. Its
+    direction is unknown where a gradient is smaller than its own tolerance, its length where one is near epsilon. There
+    the step of the pack's gradient is compared; the gradients themselves are entries of their own.
     """
-    kind, _, key = entry.partition("/")
-    want, have = (value.astype(np.float64) for value in pack.stored(entry, got))
-    size = np.abs(pack.stored(f"grad/{key}", got)[0])
-    least = _CLEAR_SHARE if kind == "new" else max(_CLEAR_SHARE, gradient_tolerance(key))
-    apart = np.abs(want - have)
-    if (apart > 2.01 * _RATE).any():
-        return math.inf
-    return float(apart[size > least * size.max()].max(initial=0.0) / max(np.abs(want).max(), 1e-6))
+    ours = "/".join(part.key for part in path)
+    key, entry = names.reference_key(ours), f"grad/{names.reference_key(ours)}"
+    values = np.array(gradient).reshape(-1)
+    if entry in pack:
+        order = names.to_reference_layout(ours, np.arange(values.size).reshape(gradient.shape)).reshape(-1)
+        places, theirs = order[::pack.stride(entry)], pack.values(entry).reshape(-1)
+        decides = np.abs(theirs) > max(gradient_tolerance(key) * np.abs(theirs).max(), _DECISIVE * _EPSILON)
+        values[places] = np.where(decides, values[places], theirs)
+    return values.reshape(gradient.shape)
 
 
 def _groups(latent: str) -> Checks:

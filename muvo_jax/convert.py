@@ -47,7 +47,8 @@ def convert(options: Options, show: screen.Screen) -> checkpoints.Stored:
       FileExistsError: where the run's folder is not empty.
       ValueError: where the file cannot be read, is of another project, or does not fit; no folder is left behind.
     """
-    run_folder.check_new(options.out, f"python -m muvo_jax.train --init={options.out}")
+    if options.out.exists() and not (options.out.is_dir() and not any(options.out.iterdir())):
+        raise FileExistsError(f"{options.out} exists already: choose another --out.")
     stored = checkpoints.read(options.checkpoint)
     model = checkpoints.recognise(stored)
     match = names.match_state_dict(stored.state_dict, model)
@@ -59,7 +60,8 @@ def convert(options: Options, show: screen.Screen) -> checkpoints.Stored:
     show.line(f"{options.checkpoint.name}: {described}" + (f"; the released {what}" if what else ""))
     config = dataclasses.replace(presets.get("paper-occupancy" if "occupancy" in model.heads else "paper"), model=model)
     config = config_lib.override(config, "data.town_size", "tiny")
-    step = int(stored.facts.get("global_step", 0))
+    step = stored.facts.get("global_step", 0)
+    step = step if type(step) is int and 0 <= step < 2**63 else 0
     ignored = dict(stored.beside) | match.ignored
     report = {"source": str(options.checkpoint.resolve()), "recognised": what, "variant": model.variant,
               "latent": model.latent, "facts": dict(stored.facts), "mapped": match.mapped, "ignored": ignored,

@@ -42,10 +42,10 @@ def load(path: str | os.PathLike) -> dict[str, np.ndarray]:
         entries = {name: entry for name, entry in header.items() if name != "__metadata__"}
         tensors = {name: _view(name, entry, data) for name, entry in entries.items()}
         position = 0
-        for start, stop in sorted(entry["data_offsets"] for entry in entries.values()):
-            if start != position:
-                raise ValueError(f"a tensor begins at byte {start} of the data, expected {position}")
-            position = stop
+        for name, entry in sorted(entries.items(), key=lambda item: item[1]["data_offsets"]):
+            if entry["data_offsets"][0] != position:
+                raise ValueError(f"{name} begins at byte {entry['data_offsets'][0]} of the data, expected {position}")
+            position = entry["data_offsets"][1]
         if position != data.size:
             raise ValueError(f"its tensors have {position} bytes, the file has {data.size}")
         return tensors

@@ -133,7 +133,8 @@ def _describe(state_dict: Mapping[str, np.ndarray]) -> config_lib.ModelConfig:
     tokens = has("rssm.prior.query_embed_image")
     fields: dict[str, Any] = {
         "numerics": "reference", "latent": "2d" if tokens else "1d",
-        "fusion": "tr" if has("transformer_encoder.") else "fc", "camera": "bev" if has("depth_decoder.") else "wob",
+        "fusion": "tr" if has("transformer_encoder.") else "fc" if has("embedding_combine.") else "avg",
+        "camera": "bev" if has("depth_decoder.") else "wob",
         "lidar": "pp" if has("point_pillars.") else "rv",
         "heads": tuple(head for head, prefix in _HEAD_PREFIXES.items() if has(prefix)), "route": has("backbone_route."),
         "navigation": has("command_encoder."), "speed": has("speed_enc.")}
@@ -187,10 +188,12 @@ def _transformer_fusion(known: Fields, state_dict: Mapping[str, np.ndarray], sha
 
 
 def _pooled_fusion(known: Fields, state_dict: Mapping[str, np.ndarray], shape: ShapeOf) -> Fields:
-    del known, state_dict
-    return {"map_channels": shape("feat_decoder.conv1.0.weight", 4)[0],
-            "embedding_channels": shape("embedding_combine.weight", 2)[0],
-            "fused_channels": shape("final_state_conv.0.conv1.weight", 4)[0]}
+    del state_dict
+    pooled = shape("final_state_conv.0.conv1.weight", 4)[0]
+    fields = {"map_channels": shape("feat_decoder.conv1.0.weight", 4)[0]}
+    if known["fusion"] == "avg":  # of an exported run; the reference has no such model
+        return fields | {"embedding_channels": pooled}
+    return fields | {"embedding_channels": shape("embedding_combine.weight", 2)[0], "fused_channels": pooled}
 
 
 def _vector_latent(known: Fields, state_dict: Mapping[str, np.ndarray], shape: ShapeOf) -> Fields:

@@ -18,7 +18,6 @@ import pickle
 import struct
 import types
 import zipfile
-from collections.abc import Mapping
 from typing import Any
 
 import ml_dtypes

@@ -7,7 +7,7 @@ from collections.abc import Callable, Collection
 from typing import Any, NamedTuple
 
 from muvo_jax import config as config_lib
-from muvo_jax.data import carla, files, kitti, plain, prepare, records, schema
+from muvo_jax.data import carla, carla_runs, files, kitti, plain, prepare, records, schema
 from muvo_jax.data.town import record
 
 
@@ -36,8 +36,8 @@ KINDS = (
          lambda path: (path / plain.DESCRIPTION_FILE).is_file(), plain.PlainRecording),
     Kind("KITTI raw", "<date>/<date>_drive_NNNN_sync folders, or one of them",
          lambda path: bool(kitti.find_drives(path)), kitti.KittiRecording, kitti.CAMERAS),
-    Kind("MUVO CARLA", f"trainval/<mode>/<Town>/<run> folders with {carla.FRAME_FILE}, or one of them",
-         lambda path: bool(carla.folders(path)), carla.CarlaRecording),
+    Kind("MUVO CARLA", f"trainval/<mode>/<Town>/<run> folders with {carla_runs.FRAME_FILE}, or one of them",
+         lambda path: bool(carla_runs.folders(path)), carla.CarlaRecording),
 )
 
 

@@ -41,18 +41,12 @@ KINDS = (
 )
 
 
-def open_recording(path: pathlib.Path | str, *, camera: str = "", skip_corrupt_shards: bool = False,
-                   labels: Collection[str] = ()) -> schema.Recording:
-    """Opens a folder with the reader of its kind (the built-in town is a plain recording in its cache folder).
-
-    Args:
-      camera: which one, where the format records several; by default the reader's choice.
-      skip_corrupt_shards: of a packed recording; see records.PackedRecording.
-      labels: which of schema.LABELS the frames should have, where the recording holds them.
+def recognise(path: pathlib.Path | str, *, camera: str = "") -> Kind:
+    """What kind of recording a folder is, without opening it.
 
     Raises:
       DataError: for a path that is missing, a file, empty or of no known kind (naming the kinds and what was found), or
-        what the reader objects to.
+        a camera that this kind does not record.
     """
     path = pathlib.Path(path).expanduser()
     known = "; ".join(f"{kind.name} ({kind.layout})" for kind in KINDS)
@@ -64,18 +58,36 @@ def open_recording(path: pathlib.Path | str, *, camera: str = "", skip_corrupt_s
     if not any(path.iterdir()):
         raise schema.DataError(f"data folder {path} is empty. Expected a recording: {known}; or \"town\", the built-in "
                                f"world.")
-    for kind in KINDS:
-        if kind.matches(path):
-            if camera and camera not in kind.cameras:
-                raise schema.DataError(f"{path}: a recording of kind {kind.name} has no camera {camera!r}"
-                                       f"{' but ' + ', '.join(kind.cameras) if kind.cameras else '; it has one only'}.")
-            if kind.open is records.PackedRecording and skip_corrupt_shards:
-                return records.PackedRecording(path, corrupt="skip")
-            options: dict[str, Any] = {"camera": camera} if camera else {}
-            if kind.open in (plain.PlainRecording, carla.CarlaRecording):
-                options["labels"] = frozenset(labels)
-            return kind.open(path, **options)
-    raise schema.DataError(f"data folder {path} is of no known kind. Known are {known}. Found {files.listing(path)}.")
+    kind = next((kind for kind in KINDS if kind.matches(path)), None)
+    if kind is None:
+        raise schema.DataError(f"data folder {path} is of no known kind. Known are {known}. Found "
+                               f"{files.listing(path)}.")
+    if camera and camera not in kind.cameras:
+        raise schema.DataError(f"{path}: a recording of kind {kind.name} has no camera {camera!r}"
+                               f"{' but ' + ', '.join(kind.cameras) if kind.cameras else '; it has one only'}.")
+    return kind
+
+
+def open_recording(path: pathlib.Path | str, *, camera: str = "", skip_corrupt_shards: bool = False,
+                   labels: Collection[str] = ()) -> schema.Recording:
+    """Opens a folder with the reader of its kind (the built-in town is a plain recording in its cache folder).
+
+    Args:
+      camera: which one, where the format records several; by default the reader's choice.
+      skip_corrupt_shards: of a packed recording; see records.PackedRecording.
+      labels: which of schema.LABELS the frames should have, where the recording holds them.
+
+    Raises:
+      DataError: as `recognise`, or what the reader objects to.
+    """
+    path = pathlib.Path(path).expanduser()
+    kind = recognise(path, camera=camera)
+    if kind.open is records.PackedRecording and skip_corrupt_shards:
+        return records.PackedRecording(path, corrupt="skip")
+    options: dict[str, Any] = {"camera": camera} if camera else {}
+    if kind.open in (plain.PlainRecording, carla.CarlaRecording):
+        options["labels"] = frozenset(labels)
+    return kind.open(path, **options)
 
 
 def open_configured(config: config_lib.Config, progress: record.Progress | None = None) -> schema.Recording:

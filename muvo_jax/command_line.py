@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import difflib
 import inspect
@@ -12,7 +13,7 @@ import sys
 import time
 import traceback
 import warnings
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any, TypeVar
 
 import jax
@@ -52,7 +53,8 @@ def run(options_type: type[_Options], work: Callable[[_Options, screen.Screen], 
     check_options(options_type, program, arguments)
     paragraphs = [inspect.getdoc(options_type) or "", "Examples:", *examples.strip().splitlines()]
     description = "\n\n".join(paragraphs)  # the help joins lines, but not paragraphs
-    options = tyro.cli(options_type, prog=f"python -m muvo_jax.{program}", args=arguments, description=description)
+    with _reader_may_leave():
+        options = tyro.cli(options_type, prog=f"python -m muvo_jax.{program}", args=arguments, description=description)
     show = screen.Screen()
     with warnings.catch_warnings():
         warnings.showwarning = lambda message, *_, **__: show.warn(str(message))  # type: ignore[assignment]
@@ -72,6 +74,19 @@ def run(options_type: type[_Options], work: Callable[[_Options, screen.Screen], 
             print("interrupted.", file=sys.stderr)
             return 130
     return 0
+
+
+@contextlib.contextmanager
+def _reader_may_leave() -> Iterator[None]:
+    """Ends with exit code 0 where the reader of what is printed here has seen enough, as in --help | head."""
+    try:
+        try:
+            yield
+        finally:
+            print(end="", flush=True)  # else a reader that has left is found at the interpreter's end
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # takes what is still buffered
+        raise SystemExit(0) from None
 
 
 def check_options(options_type: type, program: str, arguments: Sequence[str]) -> None:

@@ -39,7 +39,8 @@ CONTRACT = config_lib.ActionContract(kinematics="none", source="recorded", rate_
 _ROUTE_PX = 64
 # RawFrame key -> kind of file.
 _FILES = {"image": "image", "points_m": "points_semantic", "occupancy": "voxel", "route_map": "routemap"}
-_LABEL_FILES = {"depth_m": "depth_semantic", "image_classes": "depth_semantic", "point_classes": "points_semantic",
+_LABEL_FILES = {"depth_m": "depth_semantic", "image_classes": "depth_semantic",
+                "image_instance_mask": "depth_semantic", "point_classes": "points_semantic",
                 "birds_eye_classes": "birdview", "birds_eye_instances": "birdview"}
 
 

@@ -100,6 +100,6 @@ def open_configured(config: config_lib.Config, progress: record.Progress | None 
       DataError: as open_recording.
     """
     if config.data.path == "town":
-        return open_recording(record.cached_town(config, progress), labels=prepare.labels(config.model))
-    return open_recording(config.data.path, camera=config.data.camera, labels=prepare.labels(config.model),
+        return open_recording(record.cached_town(config, progress), labels=prepare.labels(config))
+    return open_recording(config.data.path, camera=config.data.camera, labels=prepare.labels(config),
                           skip_corrupt_shards=config.data.skip_corrupt_shards)

@@ -21,6 +21,7 @@ from muvo_jax.interop import safetensors_file, torch_file
 
 _PREFIX = "model."
 _MOST_INFLATION = 64
+_LARGEST_SIZE = 2**13  # of an axis that tells a size; the released models have 2048
 _BESIDE = {
     r"^preprocess\.": "constants of the preprocessing",
     r"^perceptual_loss\.": "network of the perceptual loss",
@@ -125,8 +126,9 @@ class _Misshapen(ValueError):
 def _describe(state_dict: Mapping[str, np.ndarray]) -> config_lib.ModelConfig:
     def shape(key: str, axes: int) -> tuple[int, ...]:
         found = state_dict[key].shape
-        if len(found) != axes or 0 in found:
-            raise _Misshapen(f"the key {key!r} that tells its size is {list(found)}, expected {axes} axes")
+        if len(found) != axes or not all(0 < size <= _LARGEST_SIZE for size in found):
+            raise _Misshapen(f"the key {key!r} that tells its size is {list(found)}, expected {axes} axes of 1 to "
+                             f"{_LARGEST_SIZE}")
         return found
 
     has = lambda prefix: any(key.startswith(prefix) for key in state_dict)

@@ -13,8 +13,8 @@ import sys
 import time
 import traceback
 import warnings
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from typing import Any, TypeVar
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import jax
 import tyro
@@ -22,6 +22,9 @@ import tyro
 from muvo_jax import config as config_lib
 from muvo_jax.data import schema, sources
 from muvo_jax.training import host, screen
+
+if TYPE_CHECKING:
+    from muvo_jax.training import checkpoint
 
 TRACEBACK_VARIABLE = "MUVO_JAX_TRACEBACK"
 EXPECTED_ERRORS = (ValueError, OSError, ArithmeticError)  # DataError, CheckpointError and NonFiniteLossError are these
@@ -142,6 +145,25 @@ def parse_settings(settings: Iterable[str]) -> dict[str, Any]:
         except json.JSONDecodeError:
             parsed[name] = text
     return parsed
+
+
+def chosen_settings(options: Any, fields: Mapping[str, str]) -> dict[str, Any]:
+    """{"data.horizon": 12} of the options that were given; `fields` says which setting each of them is."""
+    return {field: getattr(options, flag) for flag, field in fields.items() if getattr(options, flag) is not None}
+
+
+def load_run(run: pathlib.Path, which: str, show: screen.Screen) -> checkpoint.LoadedRun:
+    """The run in a folder at what --checkpoint says; shows which damaged checkpoints were passed over.
+
+    Raises:
+      ValueError, CheckpointError: as which_checkpoint and checkpoint.load_run.
+    """
+    from muvo_jax.training import checkpoint  # with Orbax, which not every command needs
+
+    loaded = checkpoint.load_run(run, which_checkpoint(which))
+    for text in loaded.warnings:
+        show.warn(text)
+    return loaded
 
 
 def which_checkpoint(text: str) -> str | int:

@@ -134,8 +134,8 @@ def configure(options: Options) -> tuple[config_lib.Config, dict[str, Any], path
     """
     if options.resume and options.init:
         raise ValueError("--resume and --init contradict each other: a resumed run has weights of its own.")
-    chosen = {field: getattr(options, flag) for flag, field in _FIELDS.items() if getattr(options, flag) is not None}
-    chosen = _variant_settings(options) | _network_settings(options) | chosen | command_line.parse_settings(options.set)
+    chosen = (_variant_settings(options) | _network_settings(options) | command_line.chosen_settings(options, _FIELDS)
+              | command_line.parse_settings(options.set))
     base = presets.get(options.preset or "town")
     folder = options.runs_dir / (options.name or default_name(options))
     if options.resume:

@@ -24,7 +24,6 @@ import numpy as np
 
 from muvo_jax import config as config_lib
 from muvo_jax.data import carla_files, carla_runs, description, ego_motion, files, schema
-from muvo_jax.ops import camera as camera_ops
 
 SENSORS_FILE = "sensors.toml"
 OCCUPANCY_FOLDER = "occupancy"
@@ -173,14 +172,7 @@ def _camera(header: dict, path: pathlib.Path, runs: list[carla_runs.Run]) -> sch
         return described
     first = next(place for run in runs for row in range(run.frames) if (place := run.path("image", row)).is_file())
     height_px, width_px = files.read_image(first, "RGB").shape[:2]
-    return schema.Camera(
-        width_px=width_px, height_px=height_px,
-        intrinsics=_rows(camera_ops.intrinsics_from_fov(width_px, height_px, FOV_RAD)),
-        camera_to_ego=_rows(camera_ops.level_camera_to_ego(MOUNT_M)))
-
-
-def _rows(matrix: np.ndarray) -> tuple[tuple[float, ...], ...]:
-    return tuple(tuple(float(value) for value in row) for row in matrix)
+    return schema.Camera.level(width_px, height_px, FOV_RAD, MOUNT_M)
 
 
 def _nearest(picture: np.ndarray, side: int) -> np.ndarray:

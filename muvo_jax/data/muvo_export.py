@@ -142,7 +142,7 @@ def _write_frame(frame: schema.RawFrame, described: schema.RecordingDescription,
         Image.fromarray(np.ascontiguousarray(pixels)).save(path(kind), compress_level=1)
 
     save("image", frame["image"])
-    depth_m = recorder.decode_depth(files.read_image(source / "depth" / f"{frame_id:06d}.png", None))
+    depth_m = plain.decode_depth(files.read_image(source / "depth" / f"{frame_id:06d}.png", None))
     classes = files.read_image(source / "classes" / f"{frame_id:06d}.png", "L")
     tags = TOWN_TAGS[np.minimum(classes, len(TOWN_TAGS) - 1)] if described.name == "town" else classes
     save("depth_semantic", np.concatenate([carla_files.encode_depth(depth_m), tags[..., None]], axis=-1))

@@ -162,7 +162,7 @@ class PlainRecording:
 
 
 def decode_depth(pixels: np.ndarray) -> np.ndarray:
-    """Centimetres (16 bit) to float32 metres, infinite in the sky."""
+    """Centimetres (16 bit) to float32 metres, infinite in the sky; the inverse of recorder.encode_depth."""
     return np.where(pixels == DEPTH_SKY, np.float32(np.inf), pixels.astype(np.float32) * np.float32(DEPTH_UNIT_M))
 
 

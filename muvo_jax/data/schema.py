@@ -12,6 +12,7 @@ from typing import Protocol, TypedDict
 import numpy as np
 
 from muvo_jax import config as config_lib
+from muvo_jax.ops import camera as camera_ops
 
 # Keys of RawFrame that a reader fills only where `labels` names them: they cost time, and few models learn from them.
 LABELS = frozenset({"depth_m", "image_classes", "image_instance_mask", "point_classes", "birds_eye_classes",
@@ -89,6 +90,18 @@ class Camera:
     height_px: int
     intrinsics: tuple[tuple[float, ...], ...]
     camera_to_ego: tuple[tuple[float, ...], ...]
+
+    @classmethod
+    def of(cls, width_px: int, height_px: int, intrinsics: np.ndarray, camera_to_ego: np.ndarray) -> Camera:
+        """From arrays [3, 3] and [4, 4]."""
+        return cls(width_px, height_px, tuple(map(tuple, intrinsics.tolist())),
+                   tuple(map(tuple, camera_to_ego.tolist())))
+
+    @classmethod
+    def level(cls, width_px: int, height_px: int, fov_rad: float, position_m: tuple[float, float, float]) -> Camera:
+        """One that looks straight ahead from a place in the ego frame; the field of view is the horizontal one."""
+        return cls.of(width_px, height_px, camera_ops.intrinsics_from_fov(width_px, height_px, fov_rad),
+                      camera_ops.level_camera_to_ego(position_m))
 
 
 @dataclasses.dataclass(frozen=True)

@@ -80,11 +80,6 @@ def expected_batch(config: config_lib.Config, windows: int, *, rewards: bool = T
     return types.Batch(is_first=timed(np.bool_), **fields)
 
 
-def shapes_of(batch: types.Batch) -> types.Batch:
-    """A batch's leaves as jax.ShapeDtypeStruct."""
-    return jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype), batch)
-
-
 def prepare(config: config_lib.Config, batch_shapes: types.Batch,
             frozen: perceptual.FrozenEncoder | None = None) -> Prepared:
     """Initialises the model and compiles its training step.

@@ -6,7 +6,7 @@ of layout is part of what is differentiated.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import jax
@@ -142,7 +142,7 @@ def cross_entropy(logits: jax.Array, target: jax.Array, **options: Any) -> jax.A
     return classification.cross_entropy_sums(_last(logits), target[:, :, 0], **options).value()
 
 
-def _dice(logits: jax.Array, target: jax.Array, epsilon: float, naive: bool) -> jax.Array:
+def _dice(logits: jax.Array, target: jax.Array, *, epsilon: float, naive: bool) -> jax.Array:
     """Of "not empty", arguments as `cross_entropy`."""
     frames = logits.shape[0] * logits.shape[1]
     filled, truth = 1.0 - jax.nn.softmax(logits, axis=2)[:, :, 0], (target[:, :, 0] != 0).astype(jnp.float32)
@@ -244,22 +244,21 @@ def class_scores(context: cases.Context) -> Checks:
         nonempty = context.draw(f"ssc_ne{classes}", shape, "uniform") < 0.5
         for tag, truths in (("batch1", [truth]), ("batch2", [truth, np.where(truth == IGNORED, 0, truth)]),
                             ("nonempty", [np.where(nonempty, truth, IGNORED)])):
-            filled = _binary_scores(prediction, truths, lambda values: values > 0)
+            filled = _binary_scores(prediction, truths, range(1, classes))
             # A class that nowhere occurs and is nowhere predicted counts as 0.
-            each = np.nan_to_num([_binary_scores(prediction, truths, lambda values, index=index: values == index)[
-                "iou_occ"] for index in range(classes)])
+            each = np.nan_to_num([_binary_scores(prediction, truths, [index])["iou_occ"] for index in range(classes)])
             overall = np.array([*(filled[name] for name in ("precision", "recall", "iou_occ")), each[1:].mean()])
             yield cases.Check(f"ssc_c{classes}_{tag}", overall, LOSS_TOLERANCE)
             yield cases.Check(f"ssc_c{classes}_{tag}_perclass", each, LOSS_TOLERANCE)
 
 
 def _binary_scores(prediction: np.ndarray, truths: list[np.ndarray],
-                   chosen: Callable[[np.ndarray], np.ndarray]) -> dict[str, float]:
+                   chosen: Sequence[int]) -> dict[str, float]:
     """Scores of occupancy over batches [N, *grid] of one prediction, where the classes `chosen` count as occupied."""
     counts = occupancy.OccupancyCounts.zeros(1)
     for truth in truths:
-        target = np.where(truth == IGNORED, IGNORED, chosen(truth))
-        counts = counts.add(chosen(prediction)[:, None], target[:, None], unknown_is_empty=False)
+        target = np.where(truth == IGNORED, IGNORED, np.isin(truth, chosen))
+        counts = counts.add(np.isin(prediction, chosen)[:, None], target[:, None], unknown_is_empty=False)
     return {name: float(value[0]) for name, value in counts.scores().items()}
 
 

@@ -160,6 +160,9 @@ def configure(options: Options) -> tuple[config_lib.Config, dict[str, Any], path
     if chosen.get("model.fusion", "tr") != "tr" and base.model.latent == "2d":
         chosen.setdefault("model.latent", "1d")  # the only one that such a fusion has
     base = config_lib.override_all(base, chosen)
+    if (options.perceptual or options.perceptual_from) and "image" not in base.model.heads:
+        raise ValueError(f"--perceptual compares images, and no head predicts any (heads {', '.join(base.model.heads)}"
+                         f"): add --with-heads=image, or leave --perceptual away.")
     if base.data.path != "town":
         base = config_lib.override(base, "data.path", str(pathlib.Path(base.data.path).expanduser().resolve()))
     return base, chosen, folder

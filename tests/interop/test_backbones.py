@@ -98,6 +98,8 @@ def test_the_perceptual_term_needs_a_network_and_says_which(resnet_file):
     assert train.frozen_encoder(presets.tiny()) is None
     with pytest.raises(ValueError, match=r"train\.perceptual_from names no network"):
         train.frozen_encoder(train.configure(train.Options(preset="tiny", set=("loss.image_perceptual=0.1",)))[0])
+    with pytest.raises(ValueError, match=r"no head predicts any \(heads action\): add --with-heads=image"):
+        train.configure(train.Options(preset="tiny", heads="action", perceptual_from=resnet_file))
     with pytest.raises(ValueError, match="--backbone-weights and --init contradict"):
         train.configure(train.Options(backbone_weights=resnet_file, init=resnet_file.parent))
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import difflib
 import pathlib
+import signal
 import sys
 
 COMMANDS = ("train", "evaluate", "dream", "plan_drive", "doctor", "voxelize", "pack", "record_carla", "export_muvo",
@@ -37,4 +38,6 @@ def main() -> int:
 
 
 if __name__ == "__main__":
+    if hasattr(signal, "SIGPIPE"):
+        signal.signal(signal.SIGPIPE, signal.SIG_DFL)  # no traceback from python -m muvo_jax | head -1
     sys.exit(main())

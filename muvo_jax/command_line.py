@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import difflib
 import inspect
@@ -12,8 +13,8 @@ import sys
 import time
 import traceback
 import warnings
-from collections.abc import Callable, Iterable, Sequence
-from typing import Any, TypeVar
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import jax
 import tyro
@@ -21,6 +22,9 @@ import tyro
 from muvo_jax import config as config_lib
 from muvo_jax.data import schema, sources
 from muvo_jax.training import host, screen
+
+if TYPE_CHECKING:
+    from muvo_jax.training import checkpoint
 
 TRACEBACK_VARIABLE = "MUVO_JAX_TRACEBACK"
 EXPECTED_ERRORS = (ValueError, OSError, ArithmeticError)  # DataError, CheckpointError and NonFiniteLossError are these
@@ -52,7 +56,8 @@ def run(options_type: type[_Options], work: Callable[[_Options, screen.Screen], 
     check_options(options_type, program, arguments)
     paragraphs = [inspect.getdoc(options_type) or "", "Examples:", *examples.strip().splitlines()]
     description = "\n\n".join(paragraphs)  # the help joins lines, but not paragraphs
-    options = tyro.cli(options_type, prog=f"python -m muvo_jax.{program}", args=arguments, description=description)
+    with _reader_may_leave():
+        options = tyro.cli(options_type, prog=f"python -m muvo_jax.{program}", args=arguments, description=description)
     show = screen.Screen()
     with warnings.catch_warnings():
         warnings.showwarning = lambda message, *_, **__: show.warn(str(message))  # type: ignore[assignment]
@@ -72,6 +77,19 @@ def run(options_type: type[_Options], work: Callable[[_Options, screen.Screen], 
             print("interrupted.", file=sys.stderr)
             return 130
     return 0
+
+
+@contextlib.contextmanager
+def _reader_may_leave() -> Iterator[None]:
+    """Ends with exit code 0 where the reader of what is printed here has seen enough, as in --help | head."""
+    try:
+        try:
+            yield
+        finally:
+            print(end="", flush=True)  # else a reader that has left is found at the interpreter's end
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # takes what is still buffered
+        raise SystemExit(0) from None
 
 
 def check_options(options_type: type, program: str, arguments: Sequence[str]) -> None:
@@ -127,6 +145,25 @@ def parse_settings(settings: Iterable[str]) -> dict[str, Any]:
         except json.JSONDecodeError:
             parsed[name] = text
     return parsed
+
+
+def chosen_settings(options: Any, fields: Mapping[str, str]) -> dict[str, Any]:
+    """{"data.horizon": 12} of the options that were given; `fields` says which setting each of them is."""
+    return {field: getattr(options, flag) for flag, field in fields.items() if getattr(options, flag) is not None}
+
+
+def load_run(run: pathlib.Path, which: str, show: screen.Screen) -> checkpoint.LoadedRun:
+    """The run in a folder at what --checkpoint says; shows which damaged checkpoints were passed over.
+
+    Raises:
+      ValueError, CheckpointError: as which_checkpoint and checkpoint.load_run.
+    """
+    from muvo_jax.training import checkpoint  # with Orbax, which not every command needs
+
+    loaded = checkpoint.load_run(run, which_checkpoint(which))
+    for text in loaded.warnings:
+        show.warn(text)
+    return loaded
 
 
 def which_checkpoint(text: str) -> str | int:

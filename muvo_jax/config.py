@@ -6,14 +6,23 @@ import dataclasses
 from typing import Any, Literal
 
 from muvo_jax.config_augmentation import AugmentationConfig
-from muvo_jax.config_heads import ALL_HEADS, BIRDS_EYE_CLASSES, EGO_MOTION_UNITS, HEADS, TARGETS, LossConfig
+from muvo_jax.config_heads import (
+    ALL_HEADS,
+    BIRDS_EYE_CLASSES,
+    EGO_MOTION_UNITS,
+    HEADS,
+    TARGETS,
+    TERM_TARGETS,
+    LossConfig,
+    head_targets,
+)
 from muvo_jax.config_json import check_choice, override, override_all, parse
 from muvo_jax.geometry import BirdsEyeGrid, PillarGrid, RangeViewGeometry, VoxelGrid
 
-__all__ = ["ALL_HEADS", "BIRDS_EYE_CLASSES", "EGO_MOTION_UNITS", "HEADS", "TARGETS", "ActionContract",
+__all__ = ["ALL_HEADS", "BIRDS_EYE_CLASSES", "EGO_MOTION_UNITS", "HEADS", "TARGETS", "TERM_TARGETS", "ActionContract",
            "AugmentationConfig", "BirdsEyeGrid", "Config", "DataConfig", "EvaluationConfig", "LossConfig",
-           "ModelConfig", "OptimizerConfig", "PillarGrid", "RangeViewGeometry", "TrainConfig", "VoxelGrid", "override",
-           "override_all", "parse"]
+           "ModelConfig", "OptimizerConfig", "PillarGrid", "RangeViewGeometry", "TrainConfig", "VoxelGrid",
+           "head_targets", "override", "override_all", "parse"]
 
 FUSIONS = ("tr", "fc", "avg")
 LIDAR_ENCODERS = ("rv", "pp")
@@ -131,11 +140,6 @@ class ModelConfig:
     convolution: Literal["auto", "xla", "gemm"] = "auto"
     range_scale_m: float = 50.0
     speed_scale_mps: float = 5.0
-
-    @property
-    def targets(self) -> dict[str, tuple[int, ...]]:
-        """What the loss terms of the heads compare with: Batch field -> its shape for one frame."""
-        return {field: shape for head in self.heads for field, shape in TARGETS[head](self).items()}
 
     @property
     def variant(self) -> str:
@@ -322,6 +326,12 @@ class Config:
     train: TrainConfig = TrainConfig()
     evaluation: EvaluationConfig = EvaluationConfig()
     contract: ActionContract = ActionContract()
+
+    @property
+    def targets(self) -> dict[str, tuple[int, ...]]:
+        """What the loss terms of the heads compare with: Batch field -> its shape for one frame."""
+        return {field: shape for head in self.model.heads
+                for field, shape in head_targets(head, self.model, self.loss).items()}
 
     def to_dict(self) -> dict[str, Any]:
         """Plain JSON types."""

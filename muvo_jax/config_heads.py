@@ -8,14 +8,15 @@ A new head is one row in each of four places, all by the same name, and nothing 
 3. objectives/terms.TABLE: its loss terms, each with the field of LossConfig that weighs it.
 4. LossConfig below: these weights.
 
-Then --with-heads=NAME trains it, a recording without its fields is refused by name, and `decode` returns it.
+Then --with-heads=NAME trains it, a recording without its fields is refused by name, and `decode` returns it. A term
+that may be off and reads fields of its own has a row in TERM_TARGETS too.
 """
 
 from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Mapping
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 HEADS = ("image", "range_view", "occupancy", "action")  # of the paper; the others are optional
 BIRDS_EYE_CLASSES = 8
@@ -41,6 +42,17 @@ TARGETS: dict[str, Callable[[Any], Shapes]] = {
 ALL_HEADS = tuple(TARGETS)
 
 
+class TermTarget(NamedTuple):
+    """A Batch field that one term reads beside those of its head, where the field `weight` of LossConfig is not 0."""
+
+    head: str
+    weight: str
+    shape: Callable[[Any], tuple[int, ...]]
+
+
+TERM_TARGETS = {"image_instance_mask": TermTarget("image", "image_instance", lambda model: model.image_size)}
+
+
 @dataclasses.dataclass(frozen=True)
 class LossConfig:
     """Weights of the loss terms (paper Eq. 1) at scale 1; scale f counts 1/f.
@@ -48,7 +60,8 @@ class LossConfig:
     `image` (L1), `image_squared` (L2, an addition to the paper), `range_xyz`, `range_depth` and `occupancy_*` apply per
     scale; 0 switches a term off. The Chamfer term looks at `chamfer_points` returns of each side; a predicted return is
     a predicted range above `return_threshold_m`. Off by default are `image_similarity` (1 - structural similarity; the
-    reference's weight is 0.06 with the 1D latent, 0.03 with the 2D one), `image_perceptual` (0.1 there) and
+    reference's weight is 0.06 with the 1D latent, 0.03 with the 2D one), `image_perceptual` (0.1 there),
+    `image_instance` (the L1 again, averaged over the pixels of vehicles and pedestrians; 0.05 there, RGB_INSTANCE) and
     `occupancy_dice`.
 
     Of the optional heads: `depth` (L1), cross-entropies `semantic_image`, `semantic_range_view` and `birds_eye`, L2 of
@@ -68,6 +81,7 @@ class LossConfig:
     action: float = 1.0
     image_similarity: float = 0.0
     image_perceptual: float = 0.0
+    image_instance: float = 0.0
     occupancy_dice: float = 0.0
     depth: float = 0.1
     semantic_image: float = 0.1
@@ -88,3 +102,10 @@ class LossConfig:
     semantic_range_view_share: float = 0.5
     birds_eye_weights: tuple[float, ...] = (1.0, 1.0, 1.0, 2.0, 3.0, 1.0, 1.0, 1.0)
     birds_eye_share: float = 0.25
+
+
+def head_targets(head: str, model: Any, loss: LossConfig) -> dict[str, tuple[int, ...]]:
+    """Batch field -> its shape for one frame, of everything that the terms of a head read."""
+    more = {field: target.shape(model) for field, target in TERM_TARGETS.items()
+            if target.head == head and getattr(loss, target.weight)}
+    return {**TARGETS[head](model), **more}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import json
 import pathlib
@@ -45,9 +46,11 @@ def convert(options: Options, show: screen.Screen) -> checkpoints.Stored:
 
     Raises:
       FileExistsError: where the run's folder is not empty.
+      OSError: where the run cannot be written.
       ValueError: where the file cannot be read, is of another project, or does not fit; no folder is left behind.
     """
-    run_folder.check_new(options.out, f"python -m muvo_jax.train --init={options.out}")
+    if options.out.exists() and not (options.out.is_dir() and not any(options.out.iterdir())):
+        raise FileExistsError(f"{options.out} exists already: choose another --out.")
     stored = checkpoints.read(options.checkpoint)
     model = checkpoints.recognise(stored)
     match = names.match_state_dict(stored.state_dict, model)
@@ -59,7 +62,8 @@ def convert(options: Options, show: screen.Screen) -> checkpoints.Stored:
     show.line(f"{options.checkpoint.name}: {described}" + (f"; the released {what}" if what else ""))
     config = dataclasses.replace(presets.get("paper-occupancy" if "occupancy" in model.heads else "paper"), model=model)
     config = config_lib.override(config, "data.town_size", "tiny")
-    step = int(stored.facts.get("global_step", 0))
+    step = stored.facts.get("global_step", 0)
+    step = step if type(step) is int and 0 <= step < 2**63 else 0
     ignored = dict(stored.beside) | match.ignored
     report = {"source": str(options.checkpoint.resolve()), "recognised": what, "variant": model.variant,
               "latent": model.latent, "facts": dict(stored.facts), "mapped": match.mapped, "ignored": ignored,
@@ -71,7 +75,25 @@ def convert(options: Options, show: screen.Screen) -> checkpoints.Stored:
 
 
 def _write(out: pathlib.Path, step: int, variables: Any, config: config_lib.Config, report: dict[str, Any]) -> None:
-    """Writes the run beside its place first, so that half a run is never left in it."""
+    """Writes the run beside its place first, so that half a run is never left in it.
+
+    Raises:
+      OSError: where it cannot be written; folders that were made for it are gone again.
+    """
+    absent = [parent for parent in out.parents if not parent.exists()]  # innermost first
+    try:
+        _write_whole(out, step, variables, config, report)
+    except Exception as error:  # Orbax and TensorStore raise OSError, ValueError or RuntimeError for a full disk
+        with contextlib.suppress(OSError):
+            for parent in absent:
+                parent.rmdir()
+        reason = (str(error).strip().splitlines() or ["no details"])[0]
+        raise OSError(f"the run could not be written to {out}: {type(error).__name__}: {reason}. Is the disk full? "
+                      f"Nothing was left behind.") from error
+
+
+def _write_whole(out: pathlib.Path, step: int, variables: Any, config: config_lib.Config,
+                 report: dict[str, Any]) -> None:
     out.parent.mkdir(parents=True, exist_ok=True)
     partial = pathlib.Path(tempfile.mkdtemp(prefix=f".{out.name}-", dir=out.parent))
     try:

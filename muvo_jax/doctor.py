@@ -52,18 +52,25 @@ def examine(options: Options, show: screen.Screen) -> checkup.Checkup:
     """Does what the command line asks for.
 
     Raises:
-      DataError: where the folder cannot be opened at all.
+      DataError: where the folder is no recording.
       RecordingProblems: where something should be mended, after everything has been written.
     """
-    recording, warned = open_recording(options.path, options.camera)
-    with show.counter("looking at", "frames") as progress:
-        result = checkup.examine(recording, warned, frames=options.frames, progress=progress)
-    out = options.out or pathlib.Path("doctor") / recording.description.name.split(",")[0]
-    for name, value in result.facts.items():
-        show.field(name, value)
+    kind = sources.recognise(options.path, camera=options.camera)
+    try:
+        recording, warned = open_recording(options.path, options.camera)
+    except schema.DataError as error:
+        described, name = None, options.path.expanduser().resolve().name
+        result = checkup.refused(f"{name} ({kind.name})", error)
+    else:
+        described, name = recording.description, recording.description.name
+        with show.counter("looking at", "frames") as progress:
+            result = checkup.examine(recording, warned, frames=options.frames, progress=progress)
+    out = options.out or pathlib.Path("doctor") / name.split(",")[0]
+    for fact, value in result.facts.items():
+        show.field(fact, value)
     for finding in result.findings:
         show.line(f"{finding.level}: {finding.text}", style="bold red" if finding.level == "problem" else "")
-    pictures = draw(recording.description, result, out)
+    pictures = draw(described, result, out) if described is not None else []
     for path in (write_report(out, result, pictures), *pictures):
         show.line(f"wrote {path}")
     if result.problems:

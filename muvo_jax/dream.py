@@ -18,7 +18,7 @@ from muvo_jax.data import pipeline, schema, windows
 from muvo_jax.data import prepare as prepare_lib
 from muvo_jax.metrics import protocol
 from muvo_jax.model import rollout, world_model
-from muvo_jax.training import checkpoint, screen
+from muvo_jax.training import screen
 from muvo_jax.viz import sheets
 
 MOST_COLUMNS = 3  # predictions beside the truth in one animation
@@ -64,16 +64,12 @@ python -m muvo_jax.dream runs/town-tr --branches=3  (three sampled futures)
 
 def dream(options: Options, show: screen.Screen) -> list[pathlib.Path]:
     """Does what the command line asks for; returns the files written."""
-    loaded = checkpoint.load_run(options.run, command_line.which_checkpoint(options.checkpoint))
-    for text in loaded.warnings:
-        show.warn(text)
-    config = loaded.config
+    loaded = command_line.load_run(options.run, options.checkpoint, show)
     if options.branches < 1:
         raise ValueError(f"--branches is {options.branches}; it must be at least 1.")
     fields = {"data": "data.path", "context": "data.context", "horizon": "data.horizon"}
-    chosen = {field: getattr(options, flag) for flag, field in fields.items() if getattr(options, flag) is not None}
-    for field, value in chosen.items():
-        config = config_lib.override(config, field, value)
+    chosen = command_line.chosen_settings(options, fields)
+    config = config_lib.override_all(loaded.config, chosen)
     recording = command_line.open_data(config, show)
     config = evaluate.fit(config, recording, tuple(chosen))
     window = choose_window(recording, config, options)

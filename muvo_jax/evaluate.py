@@ -18,7 +18,7 @@ from muvo_jax import command_line
 from muvo_jax import config as config_lib
 from muvo_jax.data import pipeline, prepare
 from muvo_jax.metrics import protocol
-from muvo_jax.training import checkpoint, checkpoint_meta, screen, validation
+from muvo_jax.training import checkpoint_meta, screen, validation
 
 # metric -> (label, decimals, whether higher is better)
 METRICS = {
@@ -73,16 +73,12 @@ python -m muvo_jax.evaluate runs/town-tr --context=8 --horizon=10 --checkpoint=b
 
 def evaluate(options: Options, show: screen.Screen) -> dict[str, Any]:
     """Does what the command line asks for; returns what evaluation.json holds."""
-    loaded = checkpoint.load_run(options.run, command_line.which_checkpoint(options.checkpoint))
-    for text in loaded.warnings:
-        show.warn(text)
-    config = loaded.config
+    loaded = command_line.load_run(options.run, options.checkpoint, show)
     fields = {"data": "data.path", "context": "data.context", "horizon": "data.horizon",
               "windows": "evaluation.windows", "batch": "evaluation.batch",
               "chamfer_points": "evaluation.chamfer_points", "sampled": "evaluation.sampled"}
-    chosen = {field: getattr(options, flag) for flag, field in fields.items() if getattr(options, flag) is not None}
-    for field, value in chosen.items():
-        config = config_lib.override(config, field, value)
+    chosen = command_line.chosen_settings(options, fields)
+    config = config_lib.override_all(loaded.config, chosen)
     recording = command_line.open_data(config, show)
     config = fit(config, recording, tuple(chosen))
     frames = pipeline.Frames(recording, config)

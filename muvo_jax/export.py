@@ -29,7 +29,7 @@ from muvo_jax import command_line, types
 from muvo_jax import config as config_lib
 from muvo_jax.model import live as live_lib
 from muvo_jax.model import rollout, world_model
-from muvo_jax.training import checkpoint, screen
+from muvo_jax.training import screen
 
 PLATFORMS = ("cpu", "cuda")
 SIGNATURES = "signatures.json"
@@ -69,9 +69,7 @@ def export(options: Options, show: screen.Screen) -> list[pathlib.Path]:
             raise ValueError(f"export needs {library}: pip install 'muvo_jax[export]'")
     if options.out.exists() and any(options.out.iterdir()):
         raise ValueError(f"OUT: {options.out} is not empty; name a new folder.")
-    loaded = checkpoint.load_run(options.run, command_line.which_checkpoint(options.checkpoint))
-    for text in loaded.warnings:
-        show.warn(text)
+    loaded = command_line.load_run(options.run, options.checkpoint, show)
     horizon = loaded.config.data.horizon if options.horizon is None else options.horizon
     written = seal(loaded.model, loaded.variables, loaded.config, options.out, horizon=horizon)
     for path in written:

@@ -74,9 +74,7 @@ python -m muvo_jax.plan_drive runs/town-tr --episodes=2 --seconds=8 --seed=1
 
 def plan_drive(options: Options, show: screen.Screen) -> dict[str, Any]:
     """Does what the command line asks for; returns what plan_drive.json holds."""
-    loaded = checkpoint.load_run(options.run, command_line.which_checkpoint(options.checkpoint))
-    for text in loaded.warnings:
-        show.warn(text)
+    loaded = command_line.load_run(options.run, options.checkpoint, show)
     config = loaded.config
     if options.episodes < 1 or options.seconds <= 0:
         raise ValueError(f"--episodes is {options.episodes} and --seconds {options.seconds}; both must be positive.")

@@ -29,6 +29,8 @@ _FIELDS = {"lidar": "model.lidar", "camera": "model.camera", "fusion": "model.fu
            "frames": "data.frames", "stride": "data.stride", "context": "data.context", "horizon": "data.horizon",
            "learning_rate": "optimizer.learning_rate", "seed": "train.seed", "parallel": "train.parallel"}
 
+_ANY_CASE = ("lidar", "camera", "fusion", "latent", "backbone")  # the paper writes RV, WOB, TR
+
 
 @dataclasses.dataclass(frozen=True)
 class Options:
@@ -134,8 +136,10 @@ def configure(options: Options) -> tuple[config_lib.Config, dict[str, Any], path
     """
     if options.resume and options.init:
         raise ValueError("--resume and --init contradict each other: a resumed run has weights of its own.")
-    chosen = {field: getattr(options, flag) for flag, field in _FIELDS.items() if getattr(options, flag) is not None}
-    chosen = _variant_settings(options) | _network_settings(options) | chosen | command_line.parse_settings(options.set)
+    options = dataclasses.replace(options, **{flag: getattr(options, flag).lower() for flag in _ANY_CASE
+                                              if getattr(options, flag) is not None})
+    chosen = (_variant_settings(options) | _network_settings(options) | command_line.chosen_settings(options, _FIELDS)
+              | command_line.parse_settings(options.set))
     base = presets.get(options.preset or "town")
     folder = options.runs_dir / (options.name or default_name(options))
     if options.resume:
@@ -156,6 +160,9 @@ def configure(options: Options) -> tuple[config_lib.Config, dict[str, Any], path
     if chosen.get("model.fusion", "tr") != "tr" and base.model.latent == "2d":
         chosen.setdefault("model.latent", "1d")  # the only one that such a fusion has
     base = config_lib.override_all(base, chosen)
+    if (options.perceptual or options.perceptual_from) and "image" not in base.model.heads:
+        raise ValueError(f"--perceptual compares images, and no head predicts any (heads {', '.join(base.model.heads)}"
+                         f"): add --with-heads=image, or leave --perceptual away.")
     if base.data.path != "town":
         base = config_lib.override(base, "data.path", str(pathlib.Path(base.data.path).expanduser().resolve()))
     return base, chosen, folder
@@ -230,7 +237,8 @@ def _heads(options: Options, heads: Sequence[str]) -> tuple[str, ...] | None:
     """
     if (options.heads, options.with_heads, options.occupancy, options.no_occupancy) == (None, None, False, False):
         return None
-    exact, more = (text.split(",") if text else [] for text in (options.heads, options.with_heads))
+    exact, more = ([name.strip() for name in text.split(",")] if text else []
+                   for text in (options.heads, options.with_heads))
     for flag, names in (("--heads", exact), ("--with-heads", more)):
         for name in names:
             config_json.check_choice(flag, name, config_lib.ALL_HEADS)

@@ -1,6 +1,7 @@
 """The commands as a user meets them: help, wrong options, and one clear line for an expected error."""
 
 import importlib
+import io
 import json
 import os
 import pathlib
@@ -53,6 +54,18 @@ def test_help_has_examples_and_every_option_explained(command, capsys, monkeypat
     _, _, examples = text.partition("Examples:")
     assert f"python -m muvo_jax.{command} " in examples
     assert "None" not in text
+
+
+@pytest.mark.parametrize("buffered", [True, False])
+def test_the_reader_of_the_help_may_leave(buffered, monkeypatch, capfd):
+    read, write = os.pipe()
+    os.close(read)
+    with io.TextIOWrapper(os.fdopen(write, "wb", buffering=-1), write_through=not buffered) as pipe:
+        monkeypatch.setattr(sys, "stdout", pipe)
+        with pytest.raises(SystemExit) as ended:
+            command_line.run(train.Options, train.train, program="train", arguments=["--help"])
+        pipe.flush()
+    assert ended.value.code == 0 and capfd.readouterr().err == ""
 
 
 def test_the_package_alone_lists_every_command(capsys, monkeypatch):

@@ -41,13 +41,17 @@ def test_times_out_of_order_are_named_by_file_and_line(tmp_path, capsys):
     table = writers.write_plain(tmp_path / "plain") / "train/a/frames.csv"
     header, first, second, *rest = table.read_text().splitlines()
     table.write_text("\n".join([header, second, first, *rest]) + "\n")
-    assert run(tmp_path / "plain", f"--out={tmp_path / 'out'}") == 1
-    assert f"{table}, line 3: time 0.000 s does not come after" in capsys.readouterr().err
     stamps = writers.write_kitti(tmp_path / "kitti") / "image_02/timestamps.txt"
     lines = stamps.read_text().splitlines()
     stamps.write_text("\n".join([*lines[:4], lines[5], lines[4], *lines[6:]]) + "\n")
-    assert run(tmp_path / "kitti", f"--out={tmp_path / 'out'}") == 1
-    assert f"{stamps}, line 6: time " in capsys.readouterr().err
+    for name, kind, text in (("plain", "plain", f"{table}, line 3: time 0.000 s does not come after"),
+                             ("kitti", "KITTI raw", f"{stamps}, line 6: time ")):
+        assert run(tmp_path / name, f"--out={tmp_path / 'out' / name}") == 1
+        captured = capsys.readouterr()
+        assert "problem: " in captured.out and "1 problems found" in captured.err
+        report = (tmp_path / "out" / name / "report.md").read_text()
+        assert f"| recording | {name} ({kind}) |" in report
+        assert text in report.partition("# What should be mended")[2].partition("# What should be known")[0]
 
 
 def test_kitti_is_looked_at_too(tmp_path, capsys):
@@ -64,5 +68,5 @@ def test_the_authors_layout_has_no_problem(tmp_path, capsys):
 
 def test_what_is_no_recording_is_one_line(tmp_path, capsys):
     (tmp_path / "x.txt").write_text("")
-    assert run(tmp_path) == 1
-    assert "is of no known kind" in capsys.readouterr().err
+    assert run(tmp_path, f"--out={tmp_path / 'out'}") == 1
+    assert "is of no known kind" in capsys.readouterr().err and not (tmp_path / "out").exists()

@@ -1,6 +1,6 @@
 """Recordings in the MUVO / MILE CARLA layout, exactly as the authors' DataWriter and generate_voxels leave them.
 
-    ROOT/trainval/<mode>/<Town>/<run>/pd_dataframe.pkl    one row a frame, paths relative to the run (carla_files.py)
+    ROOT/trainval/<mode>/<Town>/<run>/pd_dataframe.pkl    one row a frame, paths relative to the run (carla_runs.py)
     ROOT/trainval/<mode>/<Town>/<run>/occupancy/*.npz     ours, optional: muvo_jax.voxelize separates empty and unknown
     ROOT/sensors.toml                                     ours, optional: [camera], [lidar], [voxels], [action], rate_hz
 
@@ -19,18 +19,13 @@ from __future__ import annotations
 import dataclasses
 import math
 import pathlib
-import warnings
-from collections.abc import Sequence
 
 import numpy as np
 
 from muvo_jax import config as config_lib
-from muvo_jax.data import carla_files, description, ego_motion, files, safe_pickle, schema
-from muvo_jax.ops import camera as camera_ops
+from muvo_jax.data import carla_files, carla_runs, description, ego_motion, files, schema
 
-FRAME_FILE = "pd_dataframe.pkl"
 SENSORS_FILE = "sensors.toml"
-VERSION_FOLDER = "trainval"
 OCCUPANCY_FOLDER = "occupancy"
 RATE_HZ = 10.0
 MIN_MEAN_REWARD = 0.6
@@ -42,69 +37,11 @@ VOXELS = config_lib.VoxelGrid()
 # A pedal is not an acceleration: nothing can be computed from it without the car's engine.
 CONTRACT = config_lib.ActionContract(kinematics="none", source="recorded", rate_hz=RATE_HZ)
 _ROUTE_PX = 64
-_MODES = ("train", "val0", "val1", "val2")
 # RawFrame key -> kind of file.
 _FILES = {"image": "image", "points_m": "points_semantic", "occupancy": "voxel", "route_map": "routemap"}
-_LABEL_FILES = {"depth_m": "depth_semantic", "image_classes": "depth_semantic", "point_classes": "points_semantic",
+_LABEL_FILES = {"depth_m": "depth_semantic", "image_classes": "depth_semantic",
+                "image_instance_mask": "depth_semantic", "point_classes": "points_semantic",
                 "birds_eye_classes": "birdview", "birds_eye_instances": "birdview"}
-
-
-@dataclasses.dataclass(frozen=True)
-class Run:
-    """One run, as it lies there.
-
-    Attributes:
-      split, name: such as "train" and "train/Town01/0000".
-      folder: where it is.
-      columns: of the data frame, by name.
-      frames: number of rows.
-    """
-
-    split: str
-    name: str
-    folder: pathlib.Path
-    columns: dict[str, Sequence]
-
-    @property
-    def frames(self) -> int:
-        return len(self.columns["reward"])
-
-    @property
-    def mean_reward(self) -> float:
-        """What the authors filter by: of the rewards as recorded."""
-        return float(np.sum(np.asarray(self.columns["reward"], np.float64))) / self.frames
-
-    def numbers(self, column: str, size: int) -> np.ndarray:
-        """A column whose cells are arrays of `size` numbers (or numbers, for 1), float32 [frames, size].
-
-        Raises:
-          DataError: where it is missing or a cell is of another size or not finite.
-        """
-        path = self.folder / FRAME_FILE
-        if column not in self.columns:
-            raise schema.DataError(f"{path}: column {column!r} is missing; there are {', '.join(self.columns)}.")
-        cells = self.columns[column]
-        try:
-            values = np.array([np.reshape(cell, size) for cell in cells], np.float32).reshape(len(cells), size)
-        except (TypeError, ValueError) as error:
-            raise schema.DataError(f"{path}: column {column!r} does not hold {size} numbers a frame.") from error
-        if not np.isfinite(values).all():
-            row = int(np.argmin(np.isfinite(values).all(axis=1)))
-            raise schema.DataError(f"{path}, row {row}: {column} is not finite.")
-        return values
-
-    def path(self, kind: str, row: int) -> pathlib.Path:
-        """The file of a frame.
-
-        Raises:
-          DataError: where the row names no file below the run's folder.
-        """
-        relative = self.columns[f"{kind}_path"][row]
-        parts = pathlib.PurePosixPath(relative).parts if isinstance(relative, str) else ()
-        if not parts or ".." in parts or parts[0] == "/" or "\0" in relative:
-            raise schema.DataError(f"{self.folder / FRAME_FILE}, row {row}: {kind}_path is {str(relative)[:80]!r}, "
-                                   f"expected a path inside the run's folder.")
-        return self.folder.joinpath(*parts)
 
 
 class CarlaRecording:
@@ -126,7 +63,7 @@ class CarlaRecording:
         path = pathlib.Path(path)
         header = files.read_toml(path / SENSORS_FILE) if (path / SENSORS_FILE).is_file() else {}
         rate_hz = description.rate_hz(header, path / SENSORS_FILE) if "rate_hz" in header else RATE_HZ
-        every = find_runs(path)
+        every = carla_runs.find_runs(path)
         kept = [run for run in every if run.frames and not run.mean_reward < min_mean_reward]
         if not kept:
             raise schema.DataError(f"{path}: none of its {len(every)} runs has frames and a mean reward of "
@@ -138,9 +75,9 @@ class CarlaRecording:
             kept = [_with_occupancy(run) for run in kept]
         modalities = _modalities(kept, self._kinds)
         self._runs = {run.name: run for run in kept}
-        self._actions = {run.name: actions(run) for run in kept}
+        self._actions = {run.name: carla_runs.actions(run) for run in kept}
         self._speeds = {run.name: run.numbers("speed", 1)[:, 0] for run in kept}
-        self._yaw_rates = {run.name: yaw_rates(run) for run in kept if "imu" in run.columns}
+        self._yaw_rates = {run.name: carla_runs.yaw_rates(run) for run in kept if "imu" in run.columns}
         self._poses = {name: ego_motion.dead_reckoned(self._speeds[name], rates, rate_hz)
                        for name, rates in self._yaw_rates.items()}
         self._rewards = {run.name: np.clip(run.numbers("reward", 1)[:, 0], -1.0, 1.0) for run in kept}
@@ -159,7 +96,7 @@ class CarlaRecording:
             contract=description.section(header, "action", path / SENSORS_FILE, required=False)
             or dataclasses.replace(CONTRACT, rate_hz=rate_hz))
 
-    def run(self, name: str) -> Run:
+    def run(self, name: str) -> carla_runs.Run:
         """The run of a sequence, for what RawFrame does not hold."""
         return self._runs[name]
 
@@ -198,82 +135,12 @@ class CarlaRecording:
         return frame | carla_files.read_labels(paths, described.voxels or VOXELS)
 
 
-def actions(run: Run) -> np.ndarray:
-    """(acceleration, steering) of every frame, float32 [frames, 2]: the throttle where it is pressed, else -brake.
-
-    Raises:
-      DataError: where the recording has no action of three numbers a frame.
-    """
-    throttle, steer, brake = run.numbers("action", 3).T
-    return np.stack([np.where(throttle > 0, throttle, -brake), steer], axis=1)
-
-
-def yaw_rates(run: Run) -> np.ndarray:
-    """Of every frame, rad/s, left positive, float32 [frames]: the gyroscope's z axis; CARLA counts it to the right."""
-    return -run.numbers("imu", 7)[:, 5]
-
-
-def folders(path: pathlib.Path) -> list[tuple[str, pathlib.Path]]:
-    """(split, folder) of every run below a root, version, mode, town or run folder; complete or not, sorted."""
-    if (path / FRAME_FILE).is_file():
-        return [("train", path)]
-    for depth in (1, 2, 3, 4):
-        pattern = "/".join("*" * depth)
-        found = sorted(frame.parent for frame in path.glob(f"{pattern}/{FRAME_FILE}"))
-        if not found:
-            continue
-        if depth == 4 and (path / VERSION_FOLDER).is_dir():
-            found = [folder for folder in found if folder.is_relative_to(path / VERSION_FOLDER)]
-        parents = {folder.parent for folder in found}
-        beside = sorted(child for parent in parents for child in parent.iterdir() if child.is_dir())
-        return [(_split(path, folder, depth), folder) for folder in beside]
-    return []
-
-
-def find_runs(path: pathlib.Path) -> list[Run]:
-    """All runs with a data frame, good or not, in the authors' order; warns of those without.
-
-    Raises:
-      Refused: for a data frame that asks for more than data.
-      DataError: where there is no run, or a data frame lacks the columns that a frame needs.
-    """
-    places = folders(path)
-    if not places:
-        raise files.missing(path / VERSION_FOLDER / "train" / "Town01" / "0000" / FRAME_FILE, "the frames of a run")
-    lacking = [str(folder) for _, folder in places if not (folder / FRAME_FILE).is_file()]
-    if lacking:
-        warnings.warn(f"{path}: {len(lacking)} of {len(places)} runs have no {FRAME_FILE} and are left out as "
-                      f"incomplete: {', '.join(lacking[:4])}.", schema.DataWarning, stacklevel=3)
-    order = {split: position for position, split in enumerate(_MODES)}
-    complete = sorted((place for place in places if (place[1] / FRAME_FILE).is_file()),
-                      key=lambda place: (order.get(place[0], len(order)), place[0], place[1].parts))
-    return [_read_run(split, folder) for split, folder in complete]
-
-
-def _split(path: pathlib.Path, folder: pathlib.Path, depth: int) -> str:
-    mode = folder.parents[1].name if depth >= 3 else path.resolve().name
-    return mode if depth >= 3 or mode in _MODES else "train"
-
-
-def _read_run(split: str, folder: pathlib.Path) -> Run:
-    path = folder / FRAME_FILE
-    columns = safe_pickle.load_table(path)
-    lacking = [name for name in ("action", "speed", "reward") if name not in columns]
-    if lacking:
-        raise schema.DataError(f"{path}: column {', '.join(lacking)} is missing; there are "
-                               f"{', '.join(columns) or 'none'}.")
-    town = folder.resolve().parent.name
-    run = Run(split, f"{split}/{town}/{folder.resolve().name}", folder, columns)
-    run.numbers("reward", 1)  # checked before anything is summed
-    return run
-
-
 def occupancy_name(row: int) -> str:
     """Path of a frame's occupancy, relative to the run."""
     return f"{OCCUPANCY_FOLDER}/{OCCUPANCY_FOLDER}_{row:09d}.npz"
 
 
-def _with_occupancy(run: Run) -> Run:
+def _with_occupancy(run: carla_runs.Run) -> carla_runs.Run:
     names = [occupancy_name(row) for row in range(run.frames)]
     return dataclasses.replace(run, columns=run.columns | {f"{OCCUPANCY_FOLDER}_path": names})
 
@@ -286,7 +153,7 @@ def _read_occupancy(path: pathlib.Path, grid: config_lib.VoxelGrid) -> np.ndarra
     return occupancy
 
 
-def _modalities(runs: list[Run], kinds: dict[str, str]) -> frozenset[str]:
+def _modalities(runs: list[carla_runs.Run], kinds: dict[str, str]) -> frozenset[str]:
     """The keys of RawFrame that at least one run has files of; where another run lacks one, its frames are left out."""
     names = {"speed_mps", "action", "reward", "is_terminal", "timestamp_s", "frame_id"}
     if all("imu" in run.columns for run in runs):
@@ -298,21 +165,14 @@ def _modalities(runs: list[Run], kinds: dict[str, str]) -> frozenset[str]:
     return frozenset(names)
 
 
-def _camera(header: dict, path: pathlib.Path, runs: list[Run]) -> schema.Camera:
+def _camera(header: dict, path: pathlib.Path, runs: list[carla_runs.Run]) -> schema.Camera:
     """As described, else the authors' with the size of the first image there is."""
     described = description.section(header, "camera", path / SENSORS_FILE, required=False)
     if described is not None:
         return described
     first = next(place for run in runs for row in range(run.frames) if (place := run.path("image", row)).is_file())
     height_px, width_px = files.read_image(first, "RGB").shape[:2]
-    return schema.Camera(
-        width_px=width_px, height_px=height_px,
-        intrinsics=_rows(camera_ops.intrinsics_from_fov(width_px, height_px, FOV_RAD)),
-        camera_to_ego=_rows(camera_ops.level_camera_to_ego(MOUNT_M)))
-
-
-def _rows(matrix: np.ndarray) -> tuple[tuple[float, ...], ...]:
-    return tuple(tuple(float(value) for value in row) for row in matrix)
+    return schema.Camera.level(width_px, height_px, FOV_RAD, MOUNT_M)
 
 
 def _nearest(picture: np.ndarray, side: int) -> np.ndarray:
@@ -321,7 +181,8 @@ def _nearest(picture: np.ndarray, side: int) -> np.ndarray:
     return np.ascontiguousarray(picture[rows[:, None], columns])
 
 
-def _notes(every: list[Run], kept: list[Run], min_mean_reward: float, *, is_binary: bool) -> tuple[str, ...]:
+def _notes(every: list[carla_runs.Run], kept: list[carla_runs.Run], min_mean_reward: float, *,
+           is_binary: bool) -> tuple[str, ...]:
     notes = ["MUVO layout: an action is (throttle where pressed, else -brake; steering); pedals, not accelerations."]
     if len(kept) < len(every):
         notes.append(f"MUVO layout: {len(every) - len(kept)} of {len(every)} runs are left out, their mean reward is "
@@ -331,7 +192,7 @@ def _notes(every: list[Run], kept: list[Run], min_mean_reward: float, *, is_bina
     return tuple(notes)
 
 
-def _cut(run: Run, modalities: frozenset[str], kinds: dict[str, str], skipped_s: float,
+def _cut(run: carla_runs.Run, modalities: frozenset[str], kinds: dict[str, str], skipped_s: float,
          rate_hz: float) -> list[schema.Sequence]:
     """The gap-free sequences of a run after its first second; warns of gaps."""
     present = np.ones(run.frames, bool)

@@ -96,7 +96,7 @@ def read_birdview(path: pathlib.Path) -> np.ndarray:
 
 
 def read_labels(paths: Mapping[str, pathlib.Path], grid: config_lib.VoxelGrid) -> schema.RawFrame:
-    """The labels whose files are given: depth_m, image_classes, birds_eye_classes and birds_eye_instances.
+    """The labels whose files are given: depth_m, image_classes, image_instance_mask and those of the bird's eye.
 
     The bird's-eye picture is looked up at the middle of each cell of the grid's ground plan: class 255 outside of it.
 
@@ -104,10 +104,12 @@ def read_labels(paths: Mapping[str, pathlib.Path], grid: config_lib.VoxelGrid) -
       DataError: where a file is missing or damaged.
     """
     frame: schema.RawFrame = {}
-    if {"depth_m", "image_classes"} & paths.keys():
-        share, tags = read_depth_semantic(next(paths[key] for key in ("depth_m", "image_classes") if key in paths))
+    camera = [paths[key] for key in ("depth_m", "image_classes", "image_instance_mask") if key in paths]
+    if camera:  # one file
+        share, tags = read_depth_semantic(camera[0])
         frame["depth_m"] = np.where(share < 1.0, share * DEPTH_RANGE_M, np.inf).astype(np.float32)
         frame["image_classes"] = known_classes(tags)
+        frame["image_instance_mask"] = schema.instance_mask(frame["image_classes"], CLASSES)
     if "birds_eye_classes" in paths:
         bits = read_birdview(paths["birds_eye_classes"]).astype(np.uint32)
         # The highest bit that is set; 0 where none is.

@@ -18,7 +18,6 @@ import numpy as np
 from muvo_jax.data import carla, carla_frames, processes, recorder, schema
 from muvo_jax.data.carla_drives import SPLITS, BadDriveError, CarlaError, Job, Settings, estimate
 from muvo_jax.data.carla_frames import SENSORS, Observed
-from muvo_jax.ops import camera as camera_ops
 
 ATTEMPTS = 3
 MOVING_MPS = 1.0
@@ -169,10 +168,7 @@ def check_written(folder: pathlib.Path, frames: int) -> None:
 
 
 def _describe(out: pathlib.Path, settings: Settings) -> None:
-    intrinsics = camera_ops.intrinsics_from_fov(settings.width_px, settings.height_px, settings.fov_rad)
-    pose = camera_ops.level_camera_to_ego(settings.position_m)
-    camera = schema.Camera(settings.width_px, settings.height_px, tuple(map(tuple, intrinsics.tolist())),
-                           tuple(map(tuple, pose.tolist())))
+    camera = schema.Camera.level(settings.width_px, settings.height_px, settings.fov_rad, settings.position_m)
     recorder.write_description(out, name="CARLA", rate_hz=settings.rate_hz, camera=camera, lidar=settings.lidar,
                                voxels=carla.VOXELS, splits=SPLITS,
                                contract=dataclasses.replace(carla.CONTRACT, rate_hz=settings.rate_hz))

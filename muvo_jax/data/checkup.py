@@ -105,8 +105,7 @@ def examine(recording: schema.Recording, warned: Iterable[str] = (), *, frames: 
             done += 1
             if progress is not None:
                 progress(done, total)
-    table = np.array(scalars, np.float64).reshape(-1, 6)
-    motion = judgements.Motion(table[:, 0].astype(int), table[:, 1:3], table[:, 3], table[:, 4], table[:, 5])
+    motion = _motion(scalars)
     fit = _alignment(recording, samples)
     found = [judgements.Finding("problem", text) for text in warned]
     if unreadable:
@@ -120,6 +119,22 @@ def examine(recording: schema.Recording, warned: Iterable[str] = (), *, frames: 
     known = facts(recording) | {"read": f"{total - len(unreadable)} of {total} frames looked at"}
     found.sort(key=lambda finding: finding.level != "problem")
     return Checkup(known, tuple(found), motion, tuple(samples), fit)
+
+
+def refused(recording: str, error: schema.DataError) -> Checkup:
+    """What can be said of a recording whose reader refuses it: why.
+
+    Args:
+      recording: its name, for the facts.
+    """
+    finding = judgements.Finding("problem", f"{error} Until then nothing else can be looked at.")
+    return Checkup({"recording": recording, "read": "nothing"}, (finding,), _motion([]), (), None)
+
+
+def _motion(scalars: list[tuple]) -> judgements.Motion:
+    """From (stretch, acceleration, steering, speed, yaw rate, time stamp) of every frame."""
+    table = np.array(scalars, np.float64).reshape(-1, 6)
+    return judgements.Motion(table[:, 0].astype(int), table[:, 1:3], table[:, 3], table[:, 4], table[:, 5])
 
 
 def _metres(values: Iterable[float]) -> str:

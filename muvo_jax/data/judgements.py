@@ -11,6 +11,7 @@ import numpy as np
 from muvo_jax import config as config_lib
 from muvo_jax.data import alignment as alignment_lib
 from muvo_jax.data import schema
+from muvo_jax.ops import voxels
 
 # A window of the paper: 12 frames, every second recorded one.
 _WINDOW_FRAMES = 23
@@ -201,8 +202,7 @@ class Figures:
 
 
 def _share_in_voxels(points_m: np.ndarray, occupancy: np.ndarray, grid: config_lib.VoxelGrid) -> float:
-    index = np.floor((points_m - np.asarray(grid.origin_m, np.float32)) / np.float32(grid.voxel_size_m)).astype(int)
-    inside = ((index >= 0) & (index < np.asarray(grid.shape))).all(axis=1)
+    index, inside = voxels.voxel_index(points_m, grid)
     return float((occupancy[tuple(index[inside].T)] == 1).mean()) if inside.any() else 0.0
 
 

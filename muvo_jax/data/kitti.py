@@ -44,8 +44,6 @@ _DRIVE = re.compile(r"\d{4}_\d{2}_\d{2}_drive_\d{4}_sync")
 _NOTE_SPLITS = ("KITTI: the first two thirds of each drive train, the last third is split \"val\"; there is no "
                 "domain-shift split.")
 _NOTE_ACTIONS = "KITTI: actions are derived from speed, acceleration and yaw rate (bicycle model), not recorded."
-
-
 CAMERAS = ("image_00", "image_01", "image_02", "image_03")
 _SUFFIXES = {"velodyne_points": ".bin", "oxts": ".txt"}
 
@@ -248,8 +246,7 @@ def read_camera(date_folder: pathlib.Path, number: str) -> schema.Camera:
     shift = _rigid(np.eye(3), np.linalg.solve(intrinsics, projection[:, 3]))
     lidar_to_ego = _rigid(np.eye(3), np.array([0.0, 0.0, LIDAR_HEIGHT_M]))
     camera_to_ego = lidar_to_ego @ np.linalg.inv(shift @ rectify @ lidar_to_camera0)
-    return schema.Camera(width_px=width_px, height_px=height_px, intrinsics=_rows(intrinsics),
-                         camera_to_ego=_rows(camera_to_ego))
+    return schema.Camera.of(width_px, height_px, intrinsics, camera_to_ego)
 
 
 def _lines(path: pathlib.Path) -> list[str]:
@@ -261,10 +258,6 @@ def _lines(path: pathlib.Path) -> list[str]:
 
 def _rigid(rotation: np.ndarray, translation: np.ndarray) -> np.ndarray:
     return np.block([[rotation, translation[:, None]], [np.zeros((1, 3)), np.ones((1, 1))]])
-
-
-def _rows(matrix: np.ndarray) -> tuple[tuple[float, ...], ...]:
-    return tuple(tuple(float(value) for value in row) for row in matrix)
 
 
 def _read_calibration(path: pathlib.Path, sizes: dict[str, int]) -> dict[str, np.ndarray]:

@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from muvo_jax.data import carla, carla_files, files, frame_pickle, plain, recorder, schema
+from muvo_jax.data import carla, carla_files, carla_runs, files, frame_pickle, plain, recorder, schema
 
 # What the town's classes are in CARLA's tags (town/boxes.py: sky, road, marking, pavement, grass, building, ...).
 TOWN_TAGS = np.array([13, 7, 6, 8, 22, 1, 9, 5, 10, 4], np.uint8)
@@ -59,8 +59,8 @@ def export(source: pathlib.Path | str, out: pathlib.Path | str, *, town: str = "
     runs = _plan(recording, town)
     total, written = sum(sequence.length for _, sequence in runs), 0
     for folder, sequence in runs:
-        target = out / carla.VERSION_FOLDER / folder
-        if not (target / carla.FRAME_FILE).is_file():
+        target = out / carla_runs.VERSION_FOLDER / folder
+        if not (target / carla_runs.FRAME_FILE).is_file():
             for _ in _write_run(recording, source, sequence, target, town):
                 written += 1
                 if progress is not None:
@@ -125,9 +125,9 @@ def _write_run(recording: plain.PlainRecording, source: pathlib.Path, sequence: 
         rows.append(frame)
         yield index
     content = frame_pickle.frame(_columns(rows, town, has_voxels))
-    draft = target / f".{carla.FRAME_FILE}.part"
+    draft = target / f".{carla_runs.FRAME_FILE}.part"
     draft.write_bytes(content)
-    draft.replace(target / carla.FRAME_FILE)
+    draft.replace(target / carla_runs.FRAME_FILE)
 
 
 def _write_frame(frame: schema.RawFrame, described: schema.RecordingDescription, source: pathlib.Path,
@@ -142,7 +142,7 @@ def _write_frame(frame: schema.RawFrame, described: schema.RecordingDescription,
         Image.fromarray(np.ascontiguousarray(pixels)).save(path(kind), compress_level=1)
 
     save("image", frame["image"])
-    depth_m = recorder.decode_depth(files.read_image(source / "depth" / f"{frame_id:06d}.png", None))
+    depth_m = plain.decode_depth(files.read_image(source / "depth" / f"{frame_id:06d}.png", None))
     classes = files.read_image(source / "classes" / f"{frame_id:06d}.png", "L")
     tags = TOWN_TAGS[np.minimum(classes, len(TOWN_TAGS) - 1)] if described.name == "town" else classes
     save("depth_semantic", np.concatenate([carla_files.encode_depth(depth_m), tags[..., None]], axis=-1))

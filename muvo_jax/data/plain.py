@@ -10,7 +10,8 @@
 and, read only where a head learns from them,
 
     ROOT/<split>/<run>/depth/000012.png         16 bit, centimetres along the optical axis, 65535 where nothing is hit
-    ROOT/<split>/<run>/classes/000012.png       8 bit, index into `classes` of recording.toml (left out: the town's)
+    ROOT/<split>/<run>/classes/000012.png       8 bit, index into `classes` of recording.toml (left out: the town's);
+                                                those named vehicle and pedestrian make image_instance_mask
     ROOT/<split>/<run>/lidar/000012.npz         also point_tags uint8 [N], the class of each point
     ROOT/<split>/<run>/birds_eye/000012.npz     birds_eye_classes uint8 and birds_eye_instances int32 [X, Y]
 
@@ -36,6 +37,7 @@ FRAMES_FILE = "frames.csv"
 _FILES = {"image": ("image", (".png", ".jpg", ".jpeg")), "points_m": ("lidar", (".npz",)),
           "occupancy": ("occupancy", (".npz",)), "route_map": ("route_map", (".png",))}
 _LABEL_FILES = {"depth_m": ("depth", (".png",)), "image_classes": ("classes", (".png",)),
+                "image_instance_mask": ("classes", (".png",)),
                 "birds_eye_classes": ("birds_eye", (".npz",)), "birds_eye_instances": ("birds_eye", (".npz",))}
 DEPTH_UNIT_M = 0.01
 DEPTH_SKY = 65535
@@ -74,6 +76,9 @@ class PlainRecording:
         rate_hz = description.rate_hz(header, toml_path)
         self._files = _FILES | {key: place for key, place in _LABEL_FILES.items() if key in labels}
         modalities = _modalities(runs, self._files)
+        self._class_names = _class_names(header, toml_path) if labels else ()
+        if not set(schema.INSTANCE_CLASSES) & set(self._class_names):
+            modalities -= {"image_instance_mask"}
         if "point_classes" in labels and _has_point_tags(runs):
             modalities |= {"point_classes"}
         self._runs = {f"{run.split}/{run.folder.name}": run for run in runs}
@@ -88,7 +93,7 @@ class PlainRecording:
         self.description = schema.RecordingDescription(
             name=str(description.field(header, "name", str, toml_path)), kind="plain", rate_hz=rate_hz, camera=camera,
             lidar=lidar, voxels=voxels, contract=contract, modalities=modalities, splits=splits,
-            classes=_class_names(header, toml_path) if labels & {"image_classes", "point_classes"} else ())
+            classes=self._class_names if labels & {"image_classes", "point_classes"} else ())
 
     def read(self, sequence: schema.Sequence, index: int) -> schema.RawFrame:
         """See schema.Recording."""
@@ -139,9 +144,12 @@ class PlainRecording:
             if "depth_m" in paths:
                 frame["depth_m"] = decode_depth(files.read_image(paths["depth_m"], None))
                 _check_shape(frame["depth_m"], size, paths["depth_m"])
-            if "image_classes" in paths:
-                frame["image_classes"] = files.read_image(paths["image_classes"], "L")
-                _check_shape(frame["image_classes"], size, paths["image_classes"])
+            place = paths.get("image_classes", paths.get("image_instance_mask"))
+            if place is not None:
+                classes = files.read_image(place, "L")
+                _check_shape(classes, size, place)
+                frame["image_classes"] = classes
+                frame["image_instance_mask"] = schema.instance_mask(classes, self._class_names)
         if "point_classes" in described.modalities:
             frame["point_classes"] = files.read_npz(paths["points_m"], "point_tags").astype(np.uint8, copy=False)
             _check_shape(frame["point_classes"], frame["points_m"].shape[:1], paths["points_m"])
@@ -154,7 +162,7 @@ class PlainRecording:
 
 
 def decode_depth(pixels: np.ndarray) -> np.ndarray:
-    """Centimetres (16 bit) to float32 metres, infinite in the sky."""
+    """Centimetres (16 bit) to float32 metres, infinite in the sky; the inverse of recorder.encode_depth."""
     return np.where(pixels == DEPTH_SKY, np.float32(np.inf), pixels.astype(np.float32) * np.float32(DEPTH_UNIT_M))
 
 

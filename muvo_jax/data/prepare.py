@@ -28,7 +28,8 @@ _SIDE_MULTIPLE = 32
 _ALWAYS_THERE = frozenset({"image", "range_view", "occupancy", "action"})
 # Targets that are made of other fields of a frame, or brought to the model's size.
 _MADE_OF = {"ego_motion": frozenset({"pose", "speed_mps"}), "range_view_classes": frozenset({"point_classes"}),
-            "depth_m": frozenset({"depth_m"}), "image_classes": frozenset({"image_classes"})}
+            "depth_m": frozenset({"depth_m"}), "image_classes": frozenset({"image_classes"}),
+            "image_instance_mask": frozenset({"image_instance_mask"})}
 DEPTH_LIMIT_M = 100.0  # what is farther counts as nothing
 UNLABELLED = 255
 NAVIGATION = ("command", "next_command", "target_m", "next_target_m")
@@ -79,11 +80,11 @@ def prepare_frame(raw: schema.RawFrame, config: config_lib.Config) -> PreparedFr
     model = config.model
     ready: PreparedFrame = {name: raw[name] for name in ("action", "timestamp_s", "frame_id")}
     try:
-        if model.camera != config_lib.NO_SENSOR or "image" in model.targets:
+        if model.camera != config_lib.NO_SENSOR or "image" in config.targets:
             ready["image"], ready["intrinsics"] = camera_ops.resize_crop(raw["image"], raw["intrinsics"],
                                                                          model.image_size)
             ready["camera_to_ego"] = raw["camera_to_ego"]
-        if model.lidar != config_lib.NO_SENSOR or "range_view" in model.targets:
+        if model.lidar != config_lib.NO_SENSOR or "range_view" in config.targets:
             ready["range_view"] = range_view_ops.project(raw["points_m"], model.range_view)
         if "occupancy" in model.heads:
             ready["occupancy"] = _occupancy(raw, model)
@@ -98,32 +99,34 @@ def prepare_frame(raw: schema.RawFrame, config: config_lib.Config) -> PreparedFr
         ready["route_map"] = raw["route_map"]
     if model.speed:
         ready["speed_mps"] = raw["speed_mps"]
-    for name in ("reward", "is_terminal", *(model.targets.keys() - _ALWAYS_THERE - _MADE_OF.keys())):
+    for name in ("reward", "is_terminal", *(config.targets.keys() - _ALWAYS_THERE - _MADE_OF.keys())):
         if name in raw:
             ready[name] = raw[name]  # type: ignore[literal-required]
-    if "ego_motion" in model.targets:  # still in the frame of the run: motion begins with a second frame
+    if "ego_motion" in config.targets:  # still in the frame of the run: motion begins with a second frame
         ready["ego_motion"] = np.array([*raw["pose"], raw["speed_mps"]])
-    return ready | _labels(raw, model)
+    return ready | _labels(raw, config)
 
 
-def _labels(raw: schema.RawFrame, model: config_lib.ModelConfig) -> PreparedFrame:
-    """The targets of optional heads that must be brought to the model's sizes, as far as the frame has them."""
+def _labels(raw: schema.RawFrame, config: config_lib.Config) -> PreparedFrame:
+    """Targets that must be brought to the model's sizes, as far as the frame has them."""
     ready: PreparedFrame = {}
-    if "depth_m" in raw and "depth_m" in model.targets:
+    model, targets = config.model, config.targets
+    if "depth_m" in raw and "depth_m" in targets:
         depth_m = camera_ops.resize_crop_nearest(raw["depth_m"], model.image_size)
         ready["depth_m"] = np.where(depth_m < DEPTH_LIMIT_M, depth_m, range_view_ops.NO_RETURN_M).astype(np.float32)
-    if "image_classes" in raw and "image_classes" in model.targets:
-        ready["image_classes"] = camera_ops.resize_crop_nearest(raw["image_classes"], model.image_size)
-    if "point_classes" in raw and "range_view_classes" in model.targets:
+    for name in ("image_classes", "image_instance_mask"):
+        if name in raw and name in targets:
+            ready[name] = camera_ops.resize_crop_nearest(raw[name], model.image_size)  # type: ignore[literal-required]
+    if "point_classes" in raw and "range_view_classes" in targets:
         winner = range_view_ops.nearest_points(raw["points_m"], model.range_view)
         classes = np.append(raw["point_classes"], np.uint8(UNLABELLED))  # where no point is, its number is -1
         ready["range_view_classes"] = classes[winner]
     return ready
 
 
-def labels(model: config_lib.ModelConfig) -> frozenset[str]:
+def labels(config: config_lib.Config) -> frozenset[str]:
     """Which of schema.LABELS the heads of a model learn from."""
-    return schema.LABELS & _recorded(model.targets)
+    return schema.LABELS & _recorded(config.targets)
 
 
 def _recorded(targets: Collection[str]) -> frozenset[str]:
@@ -131,11 +134,17 @@ def _recorded(targets: Collection[str]) -> frozenset[str]:
     return frozenset().union(*(_MADE_OF.get(field, {field}) for field in targets)) - _ALWAYS_THERE
 
 
-def check_targets(model: config_lib.ModelConfig, description: schema.RecordingDescription) -> None:
-    """Raises DataError where a head cannot be trained: names the head, what the recording lacks, and the way out."""
-    for head in model.heads:
-        for field in sorted(_recorded(config_lib.TARGETS[head](model).keys()) - description.modalities):
-            others = ",".join(name for name in model.heads if name != head)
+def check_targets(config: config_lib.Config, description: schema.RecordingDescription) -> None:
+    """Raises DataError where a head or term cannot be trained: names it, what the recording lacks, and the way out."""
+    for head in config.model.heads:
+        fields = config_lib.head_targets(head, config.model, config.loss)
+        for field in sorted(_recorded(fields) - description.modalities):
+            if field in config_lib.TERM_TARGETS:
+                weight = config_lib.TERM_TARGETS[field].weight
+                raise schema.DataError(f"loss.{weight} is on and learns from {field}, which recording "
+                                       f"{description.name!r} does not hold. Leave the term out (--set "
+                                       f"loss.{weight}=0), or record what it takes (docs/variants.md).")
+            others = ",".join(name for name in config.model.heads if name != head)
             raise schema.DataError(f"head {head!r} learns from {field}, which recording {description.name!r} does not "
                                    f"hold. Leave the head out (--heads={others}), or record {field}.")
 

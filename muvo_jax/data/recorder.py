@@ -129,11 +129,6 @@ def encode_depth(depth_m: np.ndarray) -> np.ndarray:
     return np.minimum(centimetres, DEPTH_SKY).astype(np.uint16)
 
 
-def decode_depth(pixels: np.ndarray) -> np.ndarray:
-    """The inverse of `encode_depth`: float32 metres, infinite in the sky."""
-    return plain.decode_depth(pixels)
-
-
 def write_atomically(path: pathlib.Path, content: str | bytes) -> None:
     """Writes a file such that it is there whole or not at all."""
     draft = path.with_name(f".{path.name}.{os.getpid()}")

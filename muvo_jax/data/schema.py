@@ -12,9 +12,12 @@ from typing import Protocol, TypedDict
 import numpy as np
 
 from muvo_jax import config as config_lib
+from muvo_jax.ops import camera as camera_ops
 
 # Keys of RawFrame that a reader fills only where `labels` names them: they cost time, and few models learn from them.
-LABELS = frozenset({"depth_m", "image_classes", "point_classes", "birds_eye_classes", "birds_eye_instances"})
+LABELS = frozenset({"depth_m", "image_classes", "image_instance_mask", "point_classes", "birds_eye_classes",
+                    "birds_eye_instances"})
+INSTANCE_CLASSES = ("vehicle", "pedestrian")  # what image_instance_mask shows, by the names of a recording's classes
 
 
 class DataError(ValueError):
@@ -36,8 +39,9 @@ class RawFrame(TypedDict, total=False):
       occupancy: uint8 [X, Y, Z], 0 empty, 1 occupied, 255 unknown, in the grid `RecordingDescription.voxels`.
       route_map: uint8 [64, 64].
       depth_m: float32 [H, W], along the optical axis, infinite in the sky; image_classes: uint8 [H, W], index into
-        RecordingDescription.classes; point_classes: uint8 [N], of points_m; birds_eye_classes: uint8 [X, Y] and
-        birds_eye_instances: int32 [X, Y], on the ground plan of the voxels (muvo_jax.types.Batch). Only if asked for.
+        RecordingDescription.classes; image_instance_mask: bool [H, W], where these are INSTANCE_CLASSES;
+        point_classes: uint8 [N], of points_m; birds_eye_classes: uint8 [X, Y] and birds_eye_instances: int32 [X, Y],
+        on the ground plan of the voxels (muvo_jax.types.Batch). Only if asked for.
       action: float32 [2], applied from this frame to the next.
       speed_mps, reward, is_terminal, timestamp_s: scalars.
       command, next_command: int32 scalars, 0 to 5; target_m, next_target_m: float32 [2] (muvo_jax.types.Batch).
@@ -54,6 +58,7 @@ class RawFrame(TypedDict, total=False):
     route_map: np.ndarray
     depth_m: np.ndarray
     image_classes: np.ndarray
+    image_instance_mask: np.ndarray
     point_classes: np.ndarray
     birds_eye_classes: np.ndarray
     birds_eye_instances: np.ndarray
@@ -85,6 +90,18 @@ class Camera:
     height_px: int
     intrinsics: tuple[tuple[float, ...], ...]
     camera_to_ego: tuple[tuple[float, ...], ...]
+
+    @classmethod
+    def of(cls, width_px: int, height_px: int, intrinsics: np.ndarray, camera_to_ego: np.ndarray) -> Camera:
+        """From arrays [3, 3] and [4, 4]."""
+        return cls(width_px, height_px, tuple(map(tuple, intrinsics.tolist())),
+                   tuple(map(tuple, camera_to_ego.tolist())))
+
+    @classmethod
+    def level(cls, width_px: int, height_px: int, fov_rad: float, position_m: tuple[float, float, float]) -> Camera:
+        """One that looks straight ahead from a place in the ego frame; the field of view is the horizontal one."""
+        return cls.of(width_px, height_px, camera_ops.intrinsics_from_fov(width_px, height_px, fov_rad),
+                      camera_ops.level_camera_to_ego(position_m))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -150,6 +167,11 @@ class Recording(Protocol):
           DataError: naming the file that is missing, truncated or of another shape than the rest.
         """
         ...
+
+
+def instance_mask(classes: np.ndarray, names: tuple[str, ...]) -> np.ndarray:
+    """bool [...], where `classes`, indices into `names`, show INSTANCE_CLASSES."""
+    return np.isin(classes, [index for index, name in enumerate(names) if name in INSTANCE_CLASSES])
 
 
 def longest(sequences: tuple[Sequence, ...], split: str) -> int:

@@ -7,7 +7,7 @@ from collections.abc import Callable, Collection
 from typing import Any, NamedTuple
 
 from muvo_jax import config as config_lib
-from muvo_jax.data import carla, files, kitti, plain, prepare, records, schema
+from muvo_jax.data import carla, carla_runs, files, kitti, plain, prepare, records, schema
 from muvo_jax.data.town import record
 
 
@@ -36,9 +36,36 @@ KINDS = (
          lambda path: (path / plain.DESCRIPTION_FILE).is_file(), plain.PlainRecording),
     Kind("KITTI raw", "<date>/<date>_drive_NNNN_sync folders, or one of them",
          lambda path: bool(kitti.find_drives(path)), kitti.KittiRecording, kitti.CAMERAS),
-    Kind("MUVO CARLA", f"trainval/<mode>/<Town>/<run> folders with {carla.FRAME_FILE}, or one of them",
-         lambda path: bool(carla.folders(path)), carla.CarlaRecording),
+    Kind("MUVO CARLA", f"trainval/<mode>/<Town>/<run> folders with {carla_runs.FRAME_FILE}, or one of them",
+         lambda path: bool(carla_runs.folders(path)), carla.CarlaRecording),
 )
+
+
+def recognise(path: pathlib.Path | str, *, camera: str = "") -> Kind:
+    """What kind of recording a folder is, without opening it.
+
+    Raises:
+      DataError: for a path that is missing, a file, empty or of no known kind (naming the kinds and what was found), or
+        a camera that this kind does not record.
+    """
+    path = pathlib.Path(path).expanduser()
+    known = "; ".join(f"{kind.name} ({kind.layout})" for kind in KINDS)
+    if not path.exists():
+        raise schema.DataError(f"data folder {path} does not exist. Expected a recording: {known}; or \"town\", the "
+                               f"built-in world.")
+    if not path.is_dir():
+        raise schema.DataError(f"{path} is a file; expected the folder of a recording: {known}.")
+    if not any(path.iterdir()):
+        raise schema.DataError(f"data folder {path} is empty. Expected a recording: {known}; or \"town\", the built-in "
+                               f"world.")
+    kind = next((kind for kind in KINDS if kind.matches(path)), None)
+    if kind is None:
+        raise schema.DataError(f"data folder {path} is of no known kind. Known are {known}. Found "
+                               f"{files.listing(path)}.")
+    if camera and camera not in kind.cameras:
+        raise schema.DataError(f"{path}: a recording of kind {kind.name} has no camera {camera!r}"
+                               f"{' but ' + ', '.join(kind.cameras) if kind.cameras else '; it has one only'}.")
+    return kind
 
 
 def open_recording(path: pathlib.Path | str, *, camera: str = "", skip_corrupt_shards: bool = False,
@@ -51,31 +78,16 @@ def open_recording(path: pathlib.Path | str, *, camera: str = "", skip_corrupt_s
       labels: which of schema.LABELS the frames should have, where the recording holds them.
 
     Raises:
-      DataError: for a path that is missing, a file, empty or of no known kind (naming the kinds and what was found), or
-        what the reader objects to.
+      DataError: as `recognise`, or what the reader objects to.
     """
     path = pathlib.Path(path).expanduser()
-    known = "; ".join(f"{kind.name} ({kind.layout})" for kind in KINDS)
-    if not path.exists():
-        raise schema.DataError(f"data folder {path} does not exist. Expected a recording: {known}; or \"town\", the "
-                               f"built-in world.")
-    if not path.is_dir():
-        raise schema.DataError(f"{path} is a file; expected the folder of a recording: {known}.")
-    if not any(path.iterdir()):
-        raise schema.DataError(f"data folder {path} is empty. Expected a recording: {known}; or \"town\", the built-in "
-                               f"world.")
-    for kind in KINDS:
-        if kind.matches(path):
-            if camera and camera not in kind.cameras:
-                raise schema.DataError(f"{path}: a recording of kind {kind.name} has no camera {camera!r}"
-                                       f"{' but ' + ', '.join(kind.cameras) if kind.cameras else '; it has one only'}.")
-            if kind.open is records.PackedRecording and skip_corrupt_shards:
-                return records.PackedRecording(path, corrupt="skip")
-            options: dict[str, Any] = {"camera": camera} if camera else {}
-            if kind.open in (plain.PlainRecording, carla.CarlaRecording):
-                options["labels"] = frozenset(labels)
-            return kind.open(path, **options)
-    raise schema.DataError(f"data folder {path} is of no known kind. Known are {known}. Found {files.listing(path)}.")
+    kind = recognise(path, camera=camera)
+    if kind.open is records.PackedRecording and skip_corrupt_shards:
+        return records.PackedRecording(path, corrupt="skip")
+    options: dict[str, Any] = {"camera": camera} if camera else {}
+    if kind.open in (plain.PlainRecording, carla.CarlaRecording):
+        options["labels"] = frozenset(labels)
+    return kind.open(path, **options)
 
 
 def open_configured(config: config_lib.Config, progress: record.Progress | None = None) -> schema.Recording:
@@ -88,6 +100,6 @@ def open_configured(config: config_lib.Config, progress: record.Progress | None 
       DataError: as open_recording.
     """
     if config.data.path == "town":
-        return open_recording(record.cached_town(config, progress), labels=prepare.labels(config.model))
-    return open_recording(config.data.path, camera=config.data.camera, labels=prepare.labels(config.model),
+        return open_recording(record.cached_town(config, progress), labels=prepare.labels(config))
+    return open_recording(config.data.path, camera=config.data.camera, labels=prepare.labels(config),
                           skip_corrupt_shards=config.data.skip_corrupt_shards)

@@ -30,6 +30,7 @@ from muvo_jax import config as config_lib
 from muvo_jax.data import (
     carla,
     carla_files,
+    carla_runs,
     description,
     files,
     frame_pickle,
@@ -187,11 +188,12 @@ def _survey(path: pathlib.Path, rule: str) -> tuple[Rig, dict[pathlib.Path, list
     """What is measured with, and the frames of every run by its folder; checks that there is depth and lidar."""
     if (path / plain.DESCRIPTION_FILE).is_file():
         rig, runs = _survey_plain(path, rule)
-    elif path.is_dir() and carla.folders(path):
+    elif path.is_dir() and carla_runs.folders(path):
         rig, runs = _survey_muvo(path, rule)
     else:
         raise schema.DataError(f"{path} is no recording whose occupancy can be made; expected a plain one (a folder "
-                               f"with {plain.DESCRIPTION_FILE}) or runs of the MUVO layout (with {carla.FRAME_FILE}).")
+                               f"with {plain.DESCRIPTION_FILE}) or runs of the MUVO layout (with "
+                               f"{carla_runs.FRAME_FILE}).")
     for folder, frames in runs.items():
         for what, places in (("depth map", {frame.depth for frame in frames}),
                              ("lidar scan", {frame.points for frame in frames})):
@@ -224,11 +226,11 @@ def _survey_muvo(path: pathlib.Path, rule: str) -> tuple[Rig, dict[pathlib.Path,
     camera, lidar, grid = (description.section(header, name, toml_path, required=False)
                            for name in ("camera", "lidar", "voxels"))
     runs = {}
-    for run in carla.find_runs(path):
+    for run in carla_runs.find_runs(path):
         lacking = [kind for kind in ("depth_semantic", "points_semantic") if f"{kind}_path" not in run.columns]
         if lacking:
-            raise schema.DataError(f"{run.folder / carla.FRAME_FILE}: no column {lacking[0]}_path; occupancy is made "
-                                   f"from depth and lidar. Record both.")
+            raise schema.DataError(f"{run.folder / carla_runs.FRAME_FILE}: no column {lacking[0]}_path; occupancy is "
+                                   f"made from depth and lidar. Record both.")
         name = carla.occupancy_name if rule == "carved" else lambda row: carla_files.file_name("voxel", row)
         runs[run.folder] = [Frame(run.path("depth_semantic", row), run.path("points_semantic", row),
                                   run.folder / name(row)) for row in range(run.frames)]
@@ -260,7 +262,7 @@ def _content(rig: Rig, frame: Frame) -> bytes:
         keep: Callable[[np.ndarray], np.ndarray] = _without_own_car
         depth_m, points_m = np.where(depth < 1.0, depth * carla_files.DEPTH_RANGE_M, np.inf), scan.points_m
     else:
-        depth_m = recorder.decode_depth(files.read_image(frame.depth, None))
+        depth_m = plain.decode_depth(files.read_image(frame.depth, None))
         points_m = files.read_npz(frame.points, "points_m").astype(np.float32)
         if depth_m.ndim != 2 or points_m.shape[1:] != (3,):
             raise schema.DataError(f"{frame.depth}, {frame.points}: depth of shape {list(depth_m.shape)}, points of "
@@ -320,7 +322,7 @@ def _pinhole(camera: schema.Camera | None, shape: tuple[int, ...],
 
 def _add_column(folder: pathlib.Path, frames: list[Frame]) -> None:
     """Tells the data frame where the voxels are, as the authors' tool does; the original is kept beside it."""
-    path = folder / carla.FRAME_FILE
+    path = folder / carla_runs.FRAME_FILE
     columns = safe_pickle.load_table(path)
     if "voxel_path" in columns:
         return

@@ -60,12 +60,19 @@ def read(path: pathlib.Path | str) -> Backbone:
       BackboneError: where they are of another network.
     """
     stored = checkpoints.read(path)
-    tensors = {re.sub(r"^stages\.(\d)", r"stages_\1", key): value for key, value in stored.state_dict.items()}
-    kind = next((kind for kind, landmark in _LANDMARKS.items() if landmark in tensors), None)
-    if kind is None:
+    tensors = {re.sub(r"(^|\.)stages\.(\d)", r"\1stages_\2", key): value for key, value in stored.state_dict.items()}
+    found = [(kind, key.removesuffix(landmark)) for kind, landmark in _LANDMARKS.items() for key in tensors
+             if f".{key}".endswith(f".{landmark}")]
+    if len(found) > 1:
+        raise BackboneError(f"{path}: expected one image network, found {len(found)}: "
+                            f"{', '.join(f'{kind} under {prefix!r}' for kind, prefix in found[:4])}. Take a file that "
+                            f"holds one of them.")
+    if not found:
         raise BackboneError(f"{path}: expected a ResNet-18 or MobileViT-V2 in torchvision's or timm's names (such as "
                             f"{' or '.join(_LANDMARKS.values())}), found {len(tensors)} tensors such as "
                             f"{', '.join(list(tensors)[:4])}.")
+    kind, prefix = found[0]  # a wrapper's name, such as "module." or "backbone."; what lies beside it is not asked for
+    tensors = {key.removeprefix(prefix): value for key, value in tensors.items() if key.startswith(prefix)}
     wanted = {key for key, _, _ in _entries(_shapes(kind))}
     odd = sorted(key for key in tensors if key not in wanted and not _UNUSED.search(key))
     absent = sorted(wanted - tensors.keys())

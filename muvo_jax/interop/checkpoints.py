@@ -7,6 +7,7 @@ line, the network of the perceptual loss lie beside it.
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import os
 import pathlib
 import re
@@ -19,6 +20,8 @@ from muvo_jax import config as config_lib
 from muvo_jax.interop import safetensors_file, torch_file
 
 _PREFIX = "model."
+_MOST_INFLATION = 64
+_LARGEST_SIZE = 2**13  # of an axis that tells a size; the released models have 2048
 _BESIDE = {
     r"^preprocess\.": "constants of the preprocessing",
     r"^perceptual_loss\.": "network of the perceptual loss",
@@ -34,7 +37,7 @@ _PUBLISHED = {
 _HEAD_PREFIXES = {"image": "rgb_decoder.", "range_view": "lidar_re.", "occupancy": "voxel_decoder.",
                   "action": "policy.", "birds_eye": "bev_decoder."}
 Fields = dict[str, Any]  # of a ModelConfig
-ShapeOf = Callable[[str], tuple[int, ...]]
+ShapeOf = Callable[[str, int], tuple[int, ...]]  # of a key that has so many axes
 
 
 class CheckpointMismatch(ValueError):
@@ -73,6 +76,10 @@ def read(path: str | os.PathLike) -> Stored:
         held = f"a dict of {', '.join(map(str, list(outer)[:5]))}" if outer else f"a {type(loaded).__name__}"
         raise CheckpointMismatch(f"{path}: expected a checkpoint with tensors by name (a state_dict), found {held}.")
     tensors = {str(key): value for key, value in tensors.items() if isinstance(value, np.ndarray)}
+    wanted_bytes, file_bytes = sum(value.nbytes for value in tensors.values()), path.stat().st_size
+    if wanted_bytes > _MOST_INFLATION * file_bytes:  # views that repeat few numbers, or a bomb
+        raise CheckpointMismatch(f"{path}: expected tensors of about the size of the file, found that those in its "
+                                 f"{file_bytes} bytes would take {wanted_bytes}.")
     beside = {key: reason for key in tensors
               if (reason := next((why for pattern, why in _BESIDE.items() if re.search(pattern, key)), None))}
     inner = {key.removeprefix(_PREFIX): value for key, value in tensors.items() if key not in beside}
@@ -96,9 +103,11 @@ def recognise(stored: Stored) -> config_lib.ModelConfig:
             f"{len(state_dict)} keys such as {', '.join(list(state_dict)[:4])}.")
     try:
         return _describe(state_dict)
-    except (KeyError, IndexError) as error:
+    except KeyError as error:
         raise CheckpointMismatch(f"{stored.path}: expected a MUVO or MILE-style world model, but the key "
-                                 f"{error.args[0]!r} that tells its size is missing or has too few axes.") from error
+                                 f"{error.args[0]!r} that tells its size is missing.") from error
+    except _Misshapen as error:
+        raise CheckpointMismatch(f"{stored.path}: expected a MUVO or MILE-style world model, but {error}.") from error
     except ValueError as error:
         raise CheckpointMismatch(f"{stored.path}: its shapes describe a model that cannot be built: {error}") from error
 
@@ -110,13 +119,24 @@ def published_name(model: config_lib.ModelConfig) -> str | None:
     return _PUBLISHED.get((model.latent, "occupancy" in model.heads, model.backbone)) if model == released else None
 
 
+class _Misshapen(ValueError):
+    """A key that tells a size has another number of axes, or none."""
+
+
 def _describe(state_dict: Mapping[str, np.ndarray]) -> config_lib.ModelConfig:
-    shape = lambda key: tuple(state_dict[key].shape)
+    def shape(key: str, axes: int) -> tuple[int, ...]:
+        found = state_dict[key].shape
+        if len(found) != axes or not all(0 < size <= _LARGEST_SIZE for size in found):
+            raise _Misshapen(f"the key {key!r} that tells its size is {list(found)}, expected {axes} axes of 1 to "
+                             f"{_LARGEST_SIZE}")
+        return found
+
     has = lambda prefix: any(key.startswith(prefix) for key in state_dict)
     tokens = has("rssm.prior.query_embed_image")
     fields: dict[str, Any] = {
         "numerics": "reference", "latent": "2d" if tokens else "1d",
-        "fusion": "tr" if has("transformer_encoder.") else "fc", "camera": "bev" if has("depth_decoder.") else "wob",
+        "fusion": "tr" if has("transformer_encoder.") else "fc" if has("embedding_combine.") else "avg",
+        "camera": "bev" if has("depth_decoder.") else "wob",
         "lidar": "pp" if has("point_pillars.") else "rv",
         "heads": tuple(head for head, prefix in _HEAD_PREFIXES.items() if has(prefix)), "route": has("backbone_route."),
         "navigation": has("command_encoder."), "speed": has("speed_enc.")}
@@ -130,25 +150,27 @@ def _sensor_encoders(known: Fields, state_dict: Mapping[str, np.ndarray], shape:
     fields: Fields = {}
     if "encoder.stem.conv.weight" in state_dict:
         fields["backbone"] = "mobilevitv2_100"
-        fields["backbone_width"] = shape("encoder.stages_0.0.conv3_1x1.conv.weight")[0]
+        fields["backbone_width"] = shape("encoder.stages_0.0.conv3_1x1.conv.weight", 4)[0]
     else:
-        fields["backbone_width"] = shape("encoder.conv1.weight")[0]
+        fields["backbone_width"] = shape("encoder.conv1.weight", 4)[0]
     for key in ("speed_enc.0.weight", "gps_encoder.0.weight"):
         if key in state_dict:
-            fields["measurement_channels"] = shape(key)[0]
+            fields["measurement_channels"] = shape(key, 2)[0]
     if known["lidar"] == "pp":
-        fields["pillars"] = config_lib.PillarGrid(channels=shape("point_pillars.point_net.net.0.weight")[0])
+        fields["pillars"] = config_lib.PillarGrid(channels=shape("point_pillars.point_net.net.0.weight", 2)[0])
     if known["camera"] == "bev":
         grid = dataclasses.replace(_birds_eye_grid(state_dict.get("frustum_pooling.bev_intrinsics", np.zeros((3, 3)))),
-                                   depth_bins=shape("depth.weight")[0])
+                                   depth_bins=shape("depth.weight", 4)[0])
         if "bev_down_sample_4.0.weight" in state_dict:
-            grid = dataclasses.replace(grid, hidden_channels=shape("bev_down_sample_4.0.weight")[0])
+            grid = dataclasses.replace(grid, hidden_channels=shape("bev_down_sample_4.0.weight", 4)[0])
         fields["birds_eye"] = grid
     return fields
 
 
 def _birds_eye_grid(intrinsics: np.ndarray) -> config_lib.BirdsEyeGrid:
     """The grid whose metres the matrix maps to cells; the usual one where the matrix is not filled in."""
+    if intrinsics.shape != (3, 3) or not np.isfinite(intrinsics).all():
+        raise _Misshapen(f"frustum_pooling.bev_intrinsics is {list(intrinsics.shape)}, expected 3x3 finite numbers")
     per_m, behind, middle = (float(intrinsics[place]) for place in ((0, 0), (0, 2), (1, 2)))
     if not per_m > 0.0:
         return config_lib.BirdsEyeGrid()
@@ -157,43 +179,45 @@ def _birds_eye_grid(intrinsics: np.ndarray) -> config_lib.BirdsEyeGrid:
 
 def _transformer_fusion(known: Fields, state_dict: Mapping[str, np.ndarray], shape: ShapeOf) -> Fields:
     lidar_decoder = "point_pillar_decoder" if known["lidar"] == "pp" else "range_view_decoder"
-    fields = {"token_channels": shape("type_embedding")[2],
-              "transformer_hidden_channels": shape("transformer_encoder.layers.0.linear1.weight")[0],
-              "transformer_layers": _count(state_dict, r"^transformer_encoder\.layers\.(\d+)\."),
+    fields = {"token_channels": shape("type_embedding", 4)[2],
+              "transformer_hidden_channels": shape("transformer_encoder.layers.0.linear1.weight", 2)[0],
+              "transformer_layers": _count(state_dict, "transformer_encoder.layers"),
               "many_tokens": f"{lidar_decoder}.upsample_skip_convs.0.0.weight" in state_dict}
     if known["latent"] == "1d":
-        fields["embedding_channels"] = shape("features_combine.weight")[0]
-        fields["fused_channels"] = shape("image_feature_conv.0.conv1.weight")[0]
+        fields["embedding_channels"] = shape("features_combine.weight", 2)[0]
+        fields["fused_channels"] = shape("image_feature_conv.0.conv1.weight", 4)[0]
     return fields
 
 
 def _pooled_fusion(known: Fields, state_dict: Mapping[str, np.ndarray], shape: ShapeOf) -> Fields:
-    del known, state_dict
-    return {"map_channels": shape("feat_decoder.conv1.0.weight")[0],
-            "embedding_channels": shape("embedding_combine.weight")[0],
-            "fused_channels": shape("final_state_conv.0.conv1.weight")[0]}
+    del state_dict
+    pooled = shape("final_state_conv.0.conv1.weight", 4)[0]
+    fields = {"map_channels": shape("feat_decoder.conv1.0.weight", 4)[0]}
+    if known["fusion"] == "avg":  # of an exported run; the reference has no such model
+        return fields | {"embedding_channels": pooled}
+    return fields | {"embedding_channels": shape("embedding_combine.weight", 2)[0], "fused_channels": pooled}
 
 
 def _vector_latent(known: Fields, state_dict: Mapping[str, np.ndarray], shape: ShapeOf) -> Fields:
     heads = known["heads"]
-    fields: Fields = {"deterministic_channels": shape("rssm.pre_gru_net.0.weight")[0],
-                      "stochastic_channels": shape("rssm.pre_gru_net.0.weight")[1],
-                      "action_channels": shape("rssm.prior_action_module.0.weight")[0]}
+    fields: Fields = {"deterministic_channels": shape("rssm.pre_gru_net.0.weight", 2)[0],
+                      "stochastic_channels": shape("rssm.pre_gru_net.0.weight", 2)[1],
+                      "action_channels": shape("rssm.prior_action_module.0.weight", 2)[0]}
     for head, name in (("image", "rgb_decoder"), ("range_view", "lidar_re")):
         if head in heads:
-            fields["decoder_channels"] = shape(f"{name}.linear.0.weight")[0]
-            rows, columns = (64 * side for side in shape(f"{name}.pre_transpose_conv.0.weight")[2:])
+            fields["decoder_channels"] = shape(f"{name}.linear.0.weight", 2)[0]
+            rows, columns = (64 * side for side in shape(f"{name}.pre_transpose_conv.0.weight", 4)[2:])
             fields |= ({"image_size": (rows, columns)} if head == "image" else
                        {"range_view": config_lib.RangeViewGeometry(rows=rows, columns=columns)})
     if "birds_eye" in heads:
-        constant = shape("bev_decoder.constant_tensor")
-        blocks = _count(state_dict, r"^bev_decoder\.middle_conv\.(\d+)\.")
+        constant = shape("bev_decoder.constant_tensor", 3)
+        blocks = _count(state_dict, "bev_decoder.middle_conv")
         fields |= {"decoder_channels": constant[0], "occupancy_blocks": blocks}
         rows, columns = (side * 2 ** (blocks + 3) for side in constant[1:])
         fields["voxels"] = config_lib.VoxelGrid((rows, columns, config_lib.VoxelGrid().shape[2]))
     if "occupancy" in heads:
-        constant = shape("voxel_decoder.constant_tensor")
-        blocks = _count(state_dict, r"^voxel_decoder\.middle_conv\.(\d+)\.")
+        constant = shape("voxel_decoder.constant_tensor", 4)
+        blocks = _count(state_dict, "voxel_decoder.middle_conv")
         fields |= {"occupancy_channels": constant[0] // 2, "occupancy_blocks": blocks}
         fields["voxels"] = config_lib.VoxelGrid(tuple(side * 2 ** (blocks + 3) for side in constant[1:]))
     return fields
@@ -201,29 +225,27 @@ def _vector_latent(known: Fields, state_dict: Mapping[str, np.ndarray], shape: S
 
 def _token_latent(known: Fields, state_dict: Mapping[str, np.ndarray], shape: ShapeOf) -> Fields:
     heads = known["heads"]
-    rows, columns = shape("rssm.prior.query_embed_lidar")[2:]
+    rows, columns = shape("rssm.prior.query_embed_lidar", 4)[2:]
     fields: Fields = {
-        "image_size": tuple(32 * side for side in shape("rssm.prior.query_embed_image")[2:]),
+        "image_size": tuple(32 * side for side in shape("rssm.prior.query_embed_image", 4)[2:]),
         "range_view": config_lib.RangeViewGeometry(rows=16 * rows, columns=16 * columns),
-        "transition_layers": _count(state_dict, r"^rssm\.prior\.module\.layers\.(\d+)\.")}
+        "transition_layers": _count(state_dict, "rssm.prior.module.layers")}
     for head, name in (("image", "rgb_decoder"), ("range_view", "lidar_re"), ("birds_eye", "bev_decoder")):
         if head in heads:
-            fields["decoder_channels"] = shape(f"{name}.pre_transpose_conv.0.weight")[0]
+            fields["decoder_channels"] = shape(f"{name}.pre_transpose_conv.0.weight", 4)[0]
     stages = 1
     if "occupancy" in heads:
-        stages = _count(state_dict, r"^voxel_decoder\.pre_transpose_conv\.(\d+)\.") // 2
-        fields["occupancy_channels"] = shape("voxel_decoder.pre_transpose_conv.0.weight")[0] // 2
+        stages = _count(state_dict, "voxel_decoder.pre_transpose_conv", 2, 2)
+        fields["occupancy_channels"] = shape("voxel_decoder.pre_transpose_conv.0.weight", 5)[0] // 2
     elif "birds_eye" in heads:
-        stages = _count(state_dict, r"^bev_decoder\.pre_transpose_conv\.(\d+)\.") - 2
+        stages = _count(state_dict, "bev_decoder.pre_transpose_conv", 2)
     fields["occupancy_token_stages"] = stages
     fields["voxels"] = config_lib.VoxelGrid(
-        tuple(side * 2 ** (stages + 3) for side in shape("rssm.prior.query_embed_voxel")[2:]))
+        tuple(side * 2 ** (stages + 3) for side in shape("rssm.prior.query_embed_voxel", 5)[2:]))
     return fields
 
 
-def _count(state_dict: Mapping[str, np.ndarray], pattern: str) -> int:
-    """One more than the largest number that the pattern finds."""
-    found = [int(match[1]) for key in state_dict if (match := re.search(pattern, key))]
-    if not found:
-        raise KeyError(pattern)
-    return max(found) + 1
+def _count(state_dict: Mapping[str, np.ndarray], prefix: str, first: int = 0, step: int = 1) -> int:
+    """How many of the modules "prefix.first", "prefix.first+step", ... there are up to the first gap."""
+    return next(n for n in itertools.count()
+                if not any(key.startswith(f"{prefix}.{first + n * step}.") for key in state_dict))

@@ -13,7 +13,6 @@ import tyro
 
 from muvo_jax import command_line
 from muvo_jax.interop import names, safetensors_file
-from muvo_jax.training import checkpoint
 
 
 @dataclasses.dataclass(frozen=True)
@@ -38,7 +37,7 @@ python -m muvo_jax.interop.export_torch runs/paper-tr weights.safetensors
 
 def export(options: Options, show) -> None:
     """Does what the command line asks for."""
-    loaded = checkpoint.load_run(options.run, command_line.which_checkpoint(options.checkpoint))
+    loaded = command_line.load_run(options.run, options.checkpoint, show)
     variables = jax.tree.map(np.asarray, dict(loaded.variables))
     state_dict = names.reference_state_dict(variables, loaded.config.model)
     safetensors_file.save(options.out, state_dict, {

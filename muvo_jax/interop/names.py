@@ -222,16 +222,12 @@ class Match:
 
 def match_state_dict(state_dict: Mapping[str, np.ndarray], model_config: ModelConfig) -> Match:
     """Compares names and shapes; arguments as `convert_state_dict`."""
-    wanted = {reference_key(path): (path, shape) for path, shape in _variables(model_config)}
-    mapped = {key: path for key, (path, _) in wanted.items() if key in state_dict}
+    wanted = reference_shapes(model_config)
+    mapped = {key: path for path, _ in _variables(model_config) if (key := reference_key(path)) in state_dict}
     others = [key for key in state_dict if key not in wanted]
     ignored = {key: reason for key in others if (reason := unused_reason(key)) is not None}
-    misshapen = []
-    for key, path in mapped.items():
-        shape = wanted[key][1]
-        value = to_our_layout(path.rsplit("/")[-1], shape, np.asarray(state_dict[key]))
-        if value.shape != shape:
-            misshapen.append(f"{key} {list(state_dict[key].shape)} (becomes {list(value.shape)}, wanted {list(shape)})")
+    misshapen = [f"{key} {list(state_dict[key].shape)}, expected {list(wanted[key])}" for key in mapped
+                 if state_dict[key].shape != wanted[key]]
     return Match(mapped, ignored, [key for key in wanted if key not in state_dict],
                  [key for key in others if key not in ignored], misshapen)
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 
 from muvo_jax import config as config_lib
-from muvo_jax.data import carla_files
 
 ROUTE_CHANNEL = 1
 LIGHT_CHANNEL, LIGHT_VALUES = 14, (80, 170, 255)  # green, yellow, red
@@ -77,11 +76,6 @@ def birdview_masks(raw: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     masks += [raw[:, LIGHT_CHANNEL] == value for value in LIGHT_VALUES]
     stacked = np.stack([~np.any(masks, axis=0), *masks], axis=1)
     return stacked.astype(np.float32), raw[:, ROUTE_CHANNEL]
-
-
-def instance_mask(tags: np.ndarray) -> np.ndarray:
-    """Which pixels show vehicles or pedestrians."""
-    return (tags == carla_files.VEHICLE) | (tags == carla_files.PEDESTRIAN)
 
 
 def command_index(command: int) -> int:

@@ -7,6 +7,7 @@ more dependency, and its NumPy interface copies each tensor where a memory map i
 from __future__ import annotations
 
 import json
+import math
 import os
 import pathlib
 import struct
@@ -37,17 +38,30 @@ def load(path: str | os.PathLike) -> dict[str, np.ndarray]:
         (size,) = struct.unpack("<Q", mapped[:8].tobytes())
         if size > min(_LARGEST_HEADER, mapped.size - 8):
             raise ValueError(f"its header would have {size} bytes, the file has {mapped.size}")
-        header = json.loads(mapped[8:8 + size].tobytes())
-        return {name: _view(name, entry, mapped[8 + size:]) for name, entry in header.items() if name != "__metadata__"}
-    except (OSError, ValueError, KeyError, TypeError, AttributeError, struct.error) as error:
-        raise SafetensorsError(f"{path}: expected a safetensors file; it cannot be read ({error}).") from error
+        header, data = json.loads(mapped[8:8 + size].tobytes()), mapped[8 + size:]
+        entries = {name: entry for name, entry in header.items() if name != "__metadata__"}
+        tensors = {name: _view(name, entry, data) for name, entry in entries.items()}
+        position = 0
+        for name, entry in sorted(entries.items(), key=lambda item: item[1]["data_offsets"]):
+            if entry["data_offsets"][0] != position:
+                raise ValueError(f"{name} begins at byte {entry['data_offsets'][0]} of the data, expected {position}")
+            position = entry["data_offsets"][1]
+        if position != data.size:
+            raise ValueError(f"its tensors have {position} bytes, the file has {data.size}")
+        return tensors
+    except Exception as error:  # a damaged header is any JSON, and its parser has limits of its own
+        reason = error.strerror if isinstance(error, OSError) else str(error)
+        raise SafetensorsError(f"{path}: expected a safetensors file; it cannot be read ({type(error).__name__}: "
+                               f"{reason}).") from error
 
 
 def _view(name: str, entry: Mapping, data: np.ndarray) -> np.ndarray:
     start, stop = entry["data_offsets"]
     dtype, shape = np.dtype(_DTYPES[entry["dtype"]]), tuple(entry["shape"])
-    wanted = int(np.prod(shape, dtype=np.int64)) * dtype.itemsize
-    if not 0 <= start <= stop <= data.size or stop - start != wanted:
+    if not all(type(number) is int and number >= 0 for number in (*shape, start, stop)):
+        raise ValueError(f"{name} has the shape {list(shape)} and the bytes {start} to {stop}")
+    wanted = math.prod(shape) * dtype.itemsize
+    if not start <= stop <= data.size or stop - start != wanted:
         raise ValueError(f"{name} has the bytes {start} to {stop} of {data.size}, expected {wanted} bytes")
     return data[start:stop].view(dtype).reshape(shape)
 

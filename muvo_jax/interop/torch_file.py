@@ -3,20 +3,21 @@
 Such a file is a pickle that names classes and functions, which `pickle` would import and call. Here a name is looked up
 in a list: what builds tensors becomes functions of this module; classes of the libraries that training scripts use
 become inert `Foreign` objects, which are never imported; every other name (os.system, say) is refused before anything
-was called. Tensors are views of the memory-mapped file: optimiser states, which nobody asks for, are never read.
+was called. Tensors are views of the memory-mapped file, whose checksums are compared first where the format has them.
 """
 
 from __future__ import annotations
 
 import collections
+import functools
 import io
 import math
 import os
 import pathlib
 import pickle
 import struct
+import types
 import zipfile
-from collections.abc import Mapping
 from typing import Any
 
 import ml_dtypes
@@ -40,6 +41,8 @@ _PLAIN_BUILTINS = {kind.__name__: kind
                    for kind in (set, frozenset, dict, list, tuple, int, float, complex, bool, slice)}
 _LEGACY_MAGIC = 0x1950A86A20F9469CFC6C
 _LEGACY_PROTOCOL = 1001
+# torch.save does not compress; who zips a checkpoint anew gains little. More than this is a bomb.
+_MOST_INFLATION, _INFLATION_SLACK_BYTES = 64, 2**20
 _EXPECTED = "expected a checkpoint of torch.save (a Lightning .ckpt, or a state_dict in a .pth file)"
 
 
@@ -152,7 +155,10 @@ class _StorageType:
         self.dtype = dtype
 
 
-class _Unpickler(pickle.Unpickler):
+_Python: Any = pickle._Unpickler  # the C form allocates as many memo entries as a damaged index says
+
+
+class _Unpickler(_Python):
     """Names become what the lists of this module say; `storage` answers a reference to a storage."""
 
     def __init__(self, file: Any, storage: Any):
@@ -161,7 +167,9 @@ class _Unpickler(pickle.Unpickler):
 
     def find_class(self, module: str, name: str) -> Any:
         if (module, name) in _NAMES:
-            return _NAMES[module, name]
+            found = _NAMES[module, name]
+            # a pickle may set attributes of what it names; of a new object, it changes nothing that lasts
+            return functools.partial(found) if isinstance(found, types.FunctionType) else found
         if module.split(".")[0] == "torch" and name in _STORAGE_DTYPES:
             return _StorageType(_STORAGE_DTYPES[name])
         if module.split(".")[0] in _FOREIGN_PACKAGES:
@@ -183,8 +191,11 @@ def load(path: str | os.PathLike) -> Any:
     try:
         with path.open("rb") as file:
             head = file.read(4)
-        read = _load_zip if head == b"PK\x03\x04" else _load_legacy
-        return _resolve(read(path))
+        if head == b"PK\x03\x04":
+            return _resolve(_load_zip(path))
+        if head[:1] != pickle.PROTO:
+            raise TorchFileError("it is damaged or something else")
+        return _resolve(_load_legacy(path))
     except TorchFileError as error:
         raise TorchFileError(f"{path}: {_EXPECTED}; {error}.") from None
     except OSError as error:
@@ -200,42 +211,54 @@ def _load_zip(path: pathlib.Path) -> Any:
     except zipfile.BadZipFile as error:
         raise TorchFileError(f"it begins like a zip file but is cut short or damaged ({error})") from error
     with archive:
-        members = {info.filename: info for info in archive.infolist()}
-        pickles = [name for name in members if name.endswith("/data.pkl") or name == "data.pkl"]
+        members = _Members(archive, path)
+        pickles = [name for name in members.names if name.endswith("/data.pkl") or name == "data.pkl"]
         if len(pickles) != 1:
-            raise TorchFileError(f"it is a zip file without data.pkl (it holds {', '.join(list(members)[:4])})")
+            raise TorchFileError(f"it is a zip file without data.pkl (it holds {', '.join(list(members.names)[:4])})")
         root = pickles[0][:-len("data.pkl")]
-        if root + "byteorder" in members and archive.read(root + "byteorder") != b"little":
+        if root + "byteorder" in members.names and members.read(root + "byteorder") != b"little":
             raise TorchFileError("it was written on a big-endian machine, which is not supported")
-        mapped = np.memmap(path, np.uint8, mode="r")
         storages: dict[str, _Storage] = {}
 
         def storage(reference: Any) -> _Storage:
             dtype, key, count = _parts(reference)
             if key not in storages:
                 storages[key] = made = _Storage(dtype, count)
-                size = count * made.dtype.itemsize
-                made.array = _member(archive, members, root + "data/" + key, mapped, size).view(made.dtype)
+                made.array = members.data(f"{root}data/{key}", count * made.dtype.itemsize).view(made.dtype)
             return storages[key]
 
-        return _Unpickler(io.BytesIO(archive.read(pickles[0])), storage).load()
+        return _Unpickler(io.BytesIO(members.read(pickles[0])), storage).load()
 
 
-def _member(archive: zipfile.ZipFile, members: Mapping[str, zipfile.ZipInfo], name: str, mapped: np.ndarray,
-            size: int) -> np.ndarray:
-    """The bytes of a member: a view of the mapped file, or a copy where it is compressed."""
-    if name not in members:
-        raise TorchFileError(f"the tensor data {name} is missing")
-    info = members[name]
-    if info.compress_type != zipfile.ZIP_STORED:
-        data = np.frombuffer(archive.read(name), np.uint8)
-    else:
-        name_size, extra_size = struct.unpack("<HH", mapped[info.header_offset + 26:info.header_offset + 30].tobytes())
-        start = info.header_offset + 30 + name_size + extra_size
-        data = mapped[start:start + info.file_size]
-    if data.size < size:
-        raise TorchFileError(f"{name} has {data.size} bytes, expected {size}")
-    return data[:size]
+class _Members:
+    """The files in a zip archive: their checksums are compared, and what they unpack to is limited."""
+
+    def __init__(self, archive: zipfile.ZipFile, path: pathlib.Path):
+        self.names = {info.filename: info for info in archive.infolist()}
+        self._archive, self._mapped = archive, np.memmap(path, np.uint8, mode="r")
+        self._bytes_left = _MOST_INFLATION * self._mapped.size + _INFLATION_SLACK_BYTES
+
+    def read(self, name: str) -> bytes:
+        self._bytes_left -= self.names[name].file_size
+        if self._bytes_left < 0:
+            raise TorchFileError(f"it would unpack to more than {_MOST_INFLATION} times its {self._mapped.size} bytes")
+        return self._archive.read(name)
+
+    def data(self, name: str, size: int) -> np.ndarray:
+        """The first bytes of a member: a view of the mapped file, or a copy where it is compressed."""
+        if name not in self.names:
+            raise TorchFileError(f"the tensor data {name} is missing")
+        info = self.names[name]
+        if info.file_size < size:
+            raise TorchFileError(f"{name} has {info.file_size} bytes, expected {size}")
+        if info.compress_type != zipfile.ZIP_STORED:
+            return np.frombuffer(self.read(name), np.uint8)[:size]
+        with self._archive.open(info) as file:
+            while file.read(2**22):  # compares names, sizes and checksum
+                pass
+        header = self._mapped[info.header_offset:info.header_offset + 30].tobytes()
+        start = info.header_offset + 30 + sum(struct.unpack("<HH", header[26:]))  # name and extra field come first
+        return self._mapped[start:start + size]
 
 
 def _load_legacy(path: pathlib.Path) -> Any:
@@ -251,9 +274,13 @@ def _load_legacy(path: pathlib.Path) -> Any:
         magic = _Unpickler(file, storage).load()
         if magic != _LEGACY_MAGIC or _Unpickler(file, storage).load() != _LEGACY_PROTOCOL:
             raise TorchFileError("it is a pickle of something else")
-        _Unpickler(file, storage).load()  # sizes of types on the machine that wrote it
+        machine = _Unpickler(file, storage).load()
+        if isinstance(machine, dict) and not machine.get("little_endian", True):
+            raise TorchFileError("it was written on a big-endian machine, which is not supported")
         value = _Unpickler(file, storage).load()
         keys = _Unpickler(file, storage).load()
+        if not isinstance(keys, list) or storages.keys() != set(keys):
+            raise TorchFileError("its list of tensor data is not that of its tensors")
         mapped = np.memmap(path, np.uint8, mode="r")
         position = file.tell()
     for key in keys:
@@ -271,19 +298,32 @@ def _load_legacy(path: pathlib.Path) -> Any:
 def _parts(reference: Any) -> tuple[Any, str, int]:
     """dtype, key and number of elements of a reference ("storage", type, key, device, elements)."""
     if not isinstance(reference, tuple) or len(reference) < 5 or reference[0] != "storage":
-        raise TorchFileError(f"it refers to {str(reference)[:60]!r}, expected a storage")
+        raise TorchFileError(f"it refers to a {type(reference).__name__}, expected a storage")
     _, kind, key, _, count = reference[:5]
-    if not isinstance(kind, _StorageType) or not isinstance(count, int) or count < 0:
-        raise TorchFileError(f"it holds a storage of an unknown type ({kind})")
-    return kind.dtype, str(key), count
+    if not isinstance(kind, _StorageType) or not isinstance(key, str) or not isinstance(count, int) or count < 0:
+        raise TorchFileError("it holds a storage of an unknown type, name or size")
+    return kind.dtype, key, count
 
 
-def _resolve(value: Any) -> Any:
-    """The same nest of dicts, lists and tuples with arrays for tensors; foreign objects stay as they are."""
+def _resolve(value: Any, done: dict[int, Any] | None = None) -> Any:
+    """The same nest of dicts, lists and tuples with arrays for tensors; foreign objects stay as they are.
+
+    `done` keeps what was made of an object: one that occurs often, or in itself, is resolved once.
+    """
+    done = {} if done is None else done
+    if id(value) in done:
+        return done[id(value)]
     if isinstance(value, _Tensor):
-        return value.array()
-    if isinstance(value, dict):
-        return {key: _resolve(item) for key, item in value.items()}
-    if isinstance(value, (list, tuple)):
-        return type(value)(_resolve(item) for item in value) if type(value) in (list, tuple) else value
-    return value
+        made: Any = value.array()
+    elif isinstance(value, dict):
+        made = done[id(value)] = {}
+        made.update((key, _resolve(item, done)) for key, item in value.items())
+    elif type(value) is list:
+        made = done[id(value)] = []
+        made.extend(_resolve(item, done) for item in value)
+    elif type(value) is tuple:
+        made = tuple(_resolve(item, done) for item in value)
+    else:
+        return value
+    done[id(value)] = made
+    return made

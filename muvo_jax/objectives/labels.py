@@ -9,6 +9,7 @@ from __future__ import annotations
 import jax.numpy as jnp
 
 from muvo_jax import types
+from muvo_jax.ops import resample
 
 SCALES = (1, 2, 4)
 
@@ -17,7 +18,7 @@ def image_labels(image: types.ArrayLike) -> dict[int, types.Array]:
     """uint8 [..., H, W, 3] to {scale: float32 [..., H/scale, W/scale, 3]} in [0, 1]."""
     labels = {1: jnp.asarray(image).astype(jnp.float32) / 255.0}
     for scale in SCALES[1:]:
-        labels[scale] = _mean_2x2(labels[scale // 2])
+        labels[scale] = resample.mean_pool2(labels[scale // 2])
     return labels
 
 
@@ -34,9 +35,3 @@ def occupancy_labels(occupancy: types.ArrayLike) -> dict[int, types.Array]:
 def map_labels(array: types.ArrayLike) -> dict[int, types.Array]:
     """A map of classes, distances or numbers [..., H, W] to {scale: [..., H/scale, W/scale]}."""
     return {scale: jnp.asarray(array)[..., ::scale, ::scale] for scale in SCALES}
-
-
-def _mean_2x2(image: types.Array) -> types.Array:
-    *leading, rows, columns, channels = image.shape
-    blocks = image.reshape(*leading, rows // 2, 2, columns // 2, 2, channels)
-    return blocks.mean(axis=(-4, -2))

@@ -7,7 +7,7 @@ training mode; here it stays frozen.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import jax
@@ -18,8 +18,6 @@ from muvo_jax import types
 from muvo_jax.model import camera
 from muvo_jax.nn import norm
 from muvo_jax.objectives import regression
-
-_MEASURES: dict[str, Callable] = {"l1": jnp.abs, "l2": jnp.square}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -45,9 +43,7 @@ class FrozenEncoder:
     def distance_sums(self, prediction: types.Array, target: types.Array) -> PerceptualSums:
         """Sums of squared differences of each level, for pictures [..., H, W, 3] in [0, 1]."""
         ours, theirs = self.maps(prediction.astype(jnp.float32)), jax.lax.stop_gradient(self.maps(target))
-        return PerceptualSums(tuple(
-            regression.MeanSums(jnp.square((a - b).astype(jnp.float32)).sum(), jnp.float32(a.size))
-            for a, b in zip(ours, theirs, strict=True)))
+        return distance_sums(ours, theirs)
 
 
 @jax.tree_util.register_dataclass
@@ -62,16 +58,8 @@ class PerceptualSums:
         return {name: jnp.stack([level.value() for level in self.levels]).sum()}
 
 
-def feature_distance(features: Sequence[types.Array], targets: Sequence[types.Array], *, norm: str,
-                     style: bool) -> types.Array:
-    """Sum over levels of the mean squared ("l2") or absolute ("l1") difference of maps, and of their Gram matrices."""
-    measure, pairs = _MEASURES[norm], list(zip(features, targets, strict=True))
-    total = jnp.stack([measure(ours - theirs).mean() for ours, theirs in pairs]).sum()
-    if style:
-        total += jnp.stack([jnp.square(_gram(ours) - _gram(theirs)).mean() for ours, theirs in pairs]).sum()
-    return total
-
-
-def _gram(maps: types.Array) -> types.Array:
-    flat = maps.reshape(maps.shape[0], -1, maps.shape[-1])
-    return jnp.einsum("npc,npd->ncd", flat, flat) / (flat.shape[1] * flat.shape[2])
+def distance_sums(maps: Sequence[types.Array], targets: Sequence[types.Array]) -> PerceptualSums:
+    """Sums of squared differences of the maps of each level, [N, h, w, C]."""
+    return PerceptualSums(tuple(
+        regression.MeanSums(jnp.square((ours - theirs).astype(jnp.float32)).sum(), jnp.float32(ours.size))
+        for ours, theirs in zip(maps, targets, strict=True)))

@@ -31,7 +31,7 @@ class Inputs:
 
     Attributes:
       predictions: scale -> [B, T, ...], at every scale of the head.
-      batch: has every field that config.TARGETS names for the head.
+      batch: has every field that config.head_targets names for the head.
       model, loss: units and settings.
       keys: typed keys [B], one per sample, for terms that draw.
       frozen: the network of the perceptual term, None where it is off.
@@ -45,7 +45,7 @@ class Inputs:
     frozen: perceptual.FrozenEncoder | None = None
 
     def truth(self, field: str) -> types.Array:
-        """[B, T, ...], a field of the batch that config.TARGETS names for the head."""
+        """[B, T, ...], a field of the batch that config.head_targets names for the head."""
         return jnp.asarray(getattr(self.batch, field))
 
 
@@ -74,9 +74,12 @@ def single(*fields: str) -> dict[str, tuple[str, float]]:
 
 def _image(inputs: Inputs) -> dict[str, Sums]:
     sums: dict[str, Sums] = {}
+    masks = labels.map_labels(inputs.truth("image_instance_mask")) if inputs.loss.image_instance else None
     for scale, target in labels.image_labels(inputs.truth("image")).items():
         sums[f"image_{scale}"] = regression.l1_sums(inputs.predictions[scale], target)
         sums[f"image_squared_{scale}"] = regression.l2_sums(inputs.predictions[scale], target)
+        if masks is not None:
+            sums[f"image_instance_{scale}"] = regression.l1_sums(inputs.predictions[scale], target, masks[scale])
         if inputs.loss.image_similarity:
             sums[f"image_similarity_{scale}"] = similarity.dissimilarity_sums(inputs.predictions[scale], target)
         if inputs.loss.image_perceptual:
@@ -164,7 +167,8 @@ def _ego_motion(inputs: Inputs) -> dict[str, Sums]:
 
 
 TABLE: dict[str, HeadTerms] = {
-    "image": HeadTerms(_image, scaled("image", "image_squared", "image_similarity", "image_perceptual")),
+    "image": HeadTerms(_image, scaled("image", "image_squared", "image_similarity", "image_perceptual",
+                                       "image_instance")),
     "range_view": HeadTerms(_range_view, scaled("range_xyz", "range_depth") | {"chamfer_1": ("chamfer", 1.0)}),
     "occupancy": HeadTerms(_occupancy, scaled("occupancy_cross_entropy", "occupancy_semantic_scal",
                                               "occupancy_geometric_scal", "occupancy_dice")),

@@ -43,7 +43,7 @@ def loss_sums(predictions: types.Predictions, batch: types.Batch, observed: type
     sums: dict[str, terms.Sums] = {"kl": kl.balanced_kl_sums(observed.posterior, observed.prior,
                                                              balance=loss.kl_balance, numerics=model.numerics)}
     for head in model.heads:
-        check_head(head, predictions, batch, model)
+        check_head(head, predictions, batch, model, loss)
         sums |= terms.TABLE[head].sums(terms.Inputs(predictions[head], batch, model, loss, keys, frozen))
     return sums
 
@@ -81,14 +81,18 @@ def losses(predictions: types.Predictions, batch: types.Batch, observed: types.O
     return combine(sums, term_weights(loss, model.heads))
 
 
-def check_head(head: str, predictions: types.Predictions, batch: types.Batch, model: config_lib.ModelConfig) -> None:
+def check_head(head: str, predictions: types.Predictions, batch: types.Batch, model: config_lib.ModelConfig,
+               loss: config_lib.LossConfig) -> None:
     """Raises ValueError unless the head was predicted at its scales and the batch has its targets."""
     if head not in predictions:
         raise ValueError(f"losses: the model has the head {head!r}, the predictions have {sorted(predictions)}.")
-    for field in config_lib.TARGETS[head](model):
+    for field in config_lib.head_targets(head, model, loss):
         if getattr(batch, field, None) is None:
-            raise ValueError(f"losses: the model has the head {head!r}, but the batch has no {field}. "
-                             f"Remove the head (--heads, model.heads) or train on a recording that has it.")
+            term = config_lib.TERM_TARGETS.get(field)
+            what, remedy = ((f"loss.{term.weight} is on", "Set it to 0") if term else
+                            (f"the model has the head {head!r}", "Remove the head (--heads, model.heads)"))
+            raise ValueError(f"losses: {what}, but the batch has no {field}. {remedy} or train on a recording that has "
+                             f"it.")
     scales = heads_lib.TABLE[head].scales
     if set(predictions[head]) != set(scales):
         raise ValueError(f"losses: head {head!r} predicts scales {sorted(predictions[head])}, expected {scales}.")

@@ -12,8 +12,6 @@ import jax.numpy as jnp
 
 from muvo_jax.geometry import PillarGrid
 
-FEATURES = 8
-
 
 def pillar_indices(points_m: jax.Array, count: jax.Array, grid: PillarGrid) -> tuple[jax.Array, jax.Array]:
     """Which pillar each point is in.

@@ -1,4 +1,4 @@
-"""Changing the resolution of channels-last grids: linear up-sampling, bilinear resizing, mean and nearest cascades.
+"""Changing the resolution of channels-last grids: linear up-sampling and the mean of 2x2 pixels.
 
 Linear sampling is that of torch with align_corners=False and no antialiasing: output pixel i reads input position
 (i + 1/2) * (input size / output size) - 1/2, clamped to the grid.
@@ -10,7 +10,6 @@ import functools
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax import lax
 
 
@@ -62,38 +61,6 @@ def _upsample_axis(x, factor: int, axis: int):
     return jnp.stack(phases, axis + 1).reshape(shape)
 
 
-def resize_bilinear(x, size: tuple[int, int]):
-    """Resizes rows and columns to `size`, linearly and without antialiasing, when shrinking too.
-
-    Args:
-      x: float [..., H, W, C].
-      size: rows and columns of the result.
-
-    Returns:
-      [..., *size, C] of the dtype of x.
-
-    Raises:
-      ValueError: for an empty size.
-    """
-    if min(size) < 1:
-        raise ValueError(f"resize_bilinear: size is {size}, expected two positive integers.")
-    for axis, target in zip((x.ndim - 3, x.ndim - 2), size, strict=True):
-        x = _resize_axis(x, target, axis)
-    return x
-
-
-def _resize_axis(x, target: int, axis: int):
-    size = x.shape[axis]
-    if size == target:
-        return x
-    position = np.clip((np.arange(target) + 0.5) * (size / target) - 0.5, 0, size - 1)
-    low = np.floor(position).astype(np.int32)
-    high = np.minimum(low + 1, size - 1)
-    weight_shape = (1,) * axis + (target,) + (1,) * (x.ndim - axis - 1)
-    weight = jnp.asarray((position - low).reshape(weight_shape), x.dtype)
-    return jnp.take(x, low, axis) * (1 - weight) + jnp.take(x, high, axis) * weight
-
-
 def mean_pool2(x):
     """Mean of 2x2 pixels, float [..., H, W, C] -> [..., H/2, W/2, C].
 
@@ -104,11 +71,3 @@ def mean_pool2(x):
     if rows % 2 or columns % 2:
         raise ValueError(f"mean_pool2: got {rows}x{columns} pixels, expected even numbers of rows and columns.")
     return x.reshape(*outer, rows // 2, 2, columns // 2, 2, channels).mean((-4, -2))
-
-
-def nearest_half(x, axes: tuple[int, ...]):
-    """Every second entry (index 2i) along each of `axes`; any dtype, NumPy arrays stay NumPy."""
-    index = [slice(None)] * x.ndim
-    for axis in axes:
-        index[axis] = slice(None, None, 2)
-    return x[tuple(index)]

@@ -140,13 +140,6 @@ def occupancy_target(points_m: np.ndarray, ray_origins_m: np.ndarray, grid: conf
     return np.where(occupied, np.uint8(OCCUPIED), np.where(empty, np.uint8(EMPTY), np.uint8(UNKNOWN)))
 
 
-def voxel_centres(grid: config_lib.VoxelGrid) -> np.ndarray:
-    """Returns the centres of all voxels, ego frame, metres, float32 [X, Y, Z, 3]."""
-    axes = [origin + grid.voxel_size_m * (np.arange(count) + 0.5)
-            for origin, count in zip(grid.origin_m, grid.shape, strict=True)]
-    return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).astype(np.float32)
-
-
 def _number_and_distance(points_m: np.ndarray, grid: config_lib.VoxelGrid) -> tuple[np.ndarray, np.ndarray]:
     """Column-major number of the voxel around each point, -1 outside, and the squared distance to its lower corner.
 

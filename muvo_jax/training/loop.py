@@ -140,7 +140,7 @@ def _open_data(job: Job, show: screen.Screen) -> tuple[config_lib.Config, schema
     start_s = time.perf_counter()
     recording = job.open_recording()
     adapted = prepare.adapt(job.config, recording, keep=job.chosen)
-    prepare.check_targets(adapted.config.model, recording.description)
+    prepare.check_targets(adapted.config, recording.description)
     description = recording.description
     counts = provenance(recording, adapted.config)["frames"]
     show.field("data", f"{description.name} ({description.kind}, {description.rate_hz:g} Hz), frames: "

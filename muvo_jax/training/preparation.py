@@ -71,18 +71,13 @@ def expected_batch(config: config_lib.Config, windows: int, *, rewards: bool = T
     fields = {name: timed(types.BATCH_FIELDS[name][0], *sizes) for name, sizes in world_model.inputs(model).items()}
     if model.lidar != config_lib.NO_SENSOR:
         fields["range_view"] = timed(np.float32, model.range_view.rows, model.range_view.columns, 4)
-    if model.camera != config_lib.NO_SENSOR or "image" in model.targets:
+    if model.camera != config_lib.NO_SENSOR or "image" in config.targets:
         fields |= {"intrinsics": shape(np.float32, 3, 3), "camera_to_ego": shape(np.float32, 4, 4)}
-    fields |= {name: timed(types.BATCH_FIELDS[name][0], *sizes) for name, sizes in model.targets.items()}
+    fields |= {name: timed(types.BATCH_FIELDS[name][0], *sizes) for name, sizes in config.targets.items()}
     if rewards:
         fields |= {"reward": timed(np.float32), "is_terminal": timed(np.bool_)}
     fields["action"] = timed(np.float32, 2)
     return types.Batch(is_first=timed(np.bool_), **fields)
-
-
-def shapes_of(batch: types.Batch) -> types.Batch:
-    """A batch's leaves as jax.ShapeDtypeStruct."""
-    return jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype), batch)
 
 
 def prepare(config: config_lib.Config, batch_shapes: types.Batch,

@@ -31,10 +31,10 @@ def test_their_loss_terms_by_hand():
                         is_terminal=jnp.array([[False, True]]), ego_motion=motion)
     predictions = {"reward": {1: jnp.array([[[0.0], [0.0]]])}, "continue": {1: jnp.array([[[0.0], [2.0]]])},
                    "ego_motion": {1: jnp.zeros((1, 2, 4))}}
-    values = {}
+    values, loss = {}, config_lib.LossConfig()
     for head in LEARNED:
-        total.check_head(head, predictions, batch, MODEL.config)
-        sums = terms.TABLE[head].sums(terms.Inputs(predictions[head], batch, MODEL.config, config_lib.LossConfig(),
+        total.check_head(head, predictions, batch, MODEL.config, loss)
+        sums = terms.TABLE[head].sums(terms.Inputs(predictions[head], batch, MODEL.config, loss,
                                                    jax.random.split(jax.random.key(0), 1)))
         values |= {name: float(value) for part, found in sums.items() for name, value in found.terms(part).items()}
     want = {"reward": (0.25 + 1.0) / 2, "continue": (np.log(2) + np.log1p(np.exp(2))) / 2,

@@ -7,7 +7,7 @@ import pytest
 import recording_samples as samples
 
 from muvo_jax import presets
-from muvo_jax.data import carla, carla_files, prepare, schema, sources
+from muvo_jax.data import carla, carla_files, carla_runs, prepare, schema, sources
 
 pytestmark = pytest.mark.skipif(samples.MUVO_LAYOUT is None,
                                 reason="no recording in the MUVO layout here; name one by MUVO_LAYOUT=FOLDER")
@@ -42,7 +42,7 @@ def test_every_level_of_the_tree_is_recognised():
 
 def test_runs_of_little_reward_and_the_first_second_are_left_out():
     recording = carla.CarlaRecording(samples.MUVO_LAYOUT)
-    every = carla.find_runs(samples.MUVO_LAYOUT)
+    every = carla_runs.find_runs(samples.MUVO_LAYOUT)
     low = {run.name for run in every if run.mean_reward < 0.6}
     assert low.isdisjoint(sequence.name for sequence in recording.sequences)
     assert any(f"{len(low)} of {len(every)} runs are left out" in note for note in recording.description.notes)
@@ -114,7 +114,7 @@ def test_a_run_without_data_frame_is_counted(layout):
 
 
 def test_paths_out_of_the_run_are_refused(layout, run_folder):
-    path = run_folder / carla.FRAME_FILE
+    path = run_folder / carla_runs.FRAME_FILE
     path.write_bytes(path.read_bytes().replace(b"image/image_000000007.png", b"../../../../../etc/passwd"))
     with pytest.raises(schema.DataError, match=r"row 7: image_path is .*inside the run"):
         sources.open_recording(layout)

@@ -6,7 +6,7 @@ import recording_samples as samples
 import recording_writers as writers
 
 from muvo_jax import config as config_lib
-from muvo_jax.data import carla, carla_files, muvo_export, plain, recorder, safe_pickle, schema, sources
+from muvo_jax.data import carla, carla_files, carla_runs, muvo_export, plain, recorder, safe_pickle, schema, sources
 from muvo_jax.ops import camera as camera_ops
 
 FRAMES = 14
@@ -67,7 +67,7 @@ def test_what_is_read_back_is_what_was_recorded(source, exported):
 
 
 def test_an_export_is_resumed_and_other_sensors_are_refused(source, exported, tmp_path):
-    (exported / "trainval/val0/Town01/0000" / carla.FRAME_FILE).unlink()
+    (exported / "trainval/val0/Town01/0000" / carla_runs.FRAME_FILE).unlink()
     assert muvo_export.export(source, exported) == FRAMES
     (tmp_path / carla.SENSORS_FILE).write_text("rate_hz = 5\n")
     with pytest.raises(FileExistsError, match="describes other sensors"):
@@ -88,7 +88,7 @@ def test_built_like_the_authors_own(exported):
     assert {path.name for path in ours.iterdir()} - empty == {path.name for path in theirs.iterdir()} - empty
     for kind in carla_files.KINDS:
         assert (ours / carla_files.file_name(kind, 7)).is_file() and (theirs / carla_files.file_name(kind, 7)).is_file()
-    mine, original = (safe_pickle.load_table(folder / carla.FRAME_FILE) for folder in (ours, theirs))
+    mine, original = (safe_pickle.load_table(folder / carla_runs.FRAME_FILE) for folder in (ours, theirs))
     assert list(mine) == list(original)
     for name, column in original.items():
         assert getattr(mine[name], "dtype", None) == getattr(column, "dtype", None), name

@@ -265,11 +265,11 @@ def test_motion_since_the_frame_before_is_made_of_poses():
     preset = presets.get("tiny")
     model = dataclasses.replace(preset.model, heads=("action", "ego_motion"), speed=False)
     config = dataclasses.replace(preset, model=model, data=dataclasses.replace(preset.data, frames=3, stride=2))
-    prepare.check_targets(model, recording.description)
+    prepare.check_targets(config, recording.description)
     frames = pipeline.Frames(recording, prepare.adapt(config, recording).config)
     motion = next(pipeline.train_batches(frames, seed=0, batch=1)).ego_motion
     np.testing.assert_allclose(motion[0, 1:, :3], [[2, 0, 0], [2, 0, 0]], atol=1e-6)
     np.testing.assert_allclose(np.diff(motion[0, :, 3]), [2, 2])  # the speed of frame k is k
     blind = dataclasses.replace(recording.description, modalities=frozenset({"speed_mps"}))
     with pytest.raises(schema.DataError, match=r"head 'ego_motion' learns from pose.* \(--heads=action\)"):
-        prepare.check_targets(model, blind)
+        prepare.check_targets(config, blind)

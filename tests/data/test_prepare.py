@@ -157,6 +157,7 @@ def test_a_frame_that_does_not_fit_is_named(plain_recording):
 
 
 def test_a_head_that_the_recording_cannot_teach_is_refused_by_name(kitti_recording):
-    model = dataclasses.replace(presets.get("tiny").model, heads=("image", "birds_eye"))
+    preset = presets.get("tiny")
+    config = dataclasses.replace(preset, model=dataclasses.replace(preset.model, heads=("image", "birds_eye")))
     with pytest.raises(schema.DataError, match=r"head 'birds_eye' learns from birds_eye.* \(--heads=image\)"):
-        prepare.check_targets(model, kitti_recording.description)
+        prepare.check_targets(config, kitti_recording.description)

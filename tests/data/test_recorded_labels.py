@@ -13,7 +13,8 @@ from muvo_jax.data.town.simulator import Town
 from muvo_jax.ops import camera, range_view
 
 HEADS = ("image", "depth", "semantic_image", "semantic_range_view", "birds_eye")
-CONFIG = dataclasses.replace(presets.tiny(), model=dataclasses.replace(presets.tiny().model, heads=HEADS))
+CONFIG = dataclasses.replace(presets.tiny(), model=dataclasses.replace(presets.tiny().model, heads=HEADS),
+                             loss=dataclasses.replace(presets.tiny().loss, image_instance=0.05))
 
 
 @pytest.fixture(scope="module")
@@ -24,16 +25,16 @@ def recording(tmp_path_factory):
     record.describe(folder, town_config, ("train",))
     for _ in record.record_run(folder, Town(town_config), record.Job("train", "000_day", 7, "clear_noon", 8)):
         pass
-    return plain.PlainRecording(folder, labels=prepare.labels(CONFIG.model))
+    return plain.PlainRecording(folder, labels=prepare.labels(CONFIG))
 
 
 def test_the_town_teaches_every_optional_head(recording):
-    prepare.check_targets(CONFIG.model, recording.description)
+    prepare.check_targets(CONFIG, recording.description)
     model = prepare.adapt(dataclasses.replace(CONFIG, data=dataclasses.replace(CONFIG.data, stride=1)), recording)
     assert model.config.model.semantic_classes == len(boxes.CLASSES) == CONFIG.model.semantic_classes
     batch = pipeline.Frames(recording, model.config).batch([pipeline.windows_lib.Window(
         recording.sequences[0], 0, 2, 1)])
-    for field, shape in CONFIG.model.targets.items():
+    for field, shape in CONFIG.targets.items():
         assert getattr(batch, field).shape == (1, 2, *shape)
     raw = recording.read(recording.sequences[0], 0)
     # A scan hits what the camera sees there: points in view have the class of their pixel, but for edges.
@@ -44,6 +45,9 @@ def test_the_town_teaches_every_optional_head(recording):
     assert (raw["image_classes"][row, column] == raw["point_classes"][seen]).mean() > 0.9
     view = range_view.project(raw["points_m"], CONFIG.model.range_view)
     np.testing.assert_array_equal(batch.range_view_classes[0, 0] == prepare.UNLABELLED, view[..., 3] < 0)
+    road_users = np.isin(batch.image_classes, (boxes.VEHICLE, boxes.PEDESTRIAN))
+    assert batch.image_instance_mask.dtype == bool and road_users.any()
+    np.testing.assert_array_equal(batch.image_instance_mask, road_users)
     sky = batch.image_classes[0, 0] == boxes.SKY
     assert sky.any() and (batch.depth_m[0, 0][sky] == -1).all() and batch.depth_m.max() <= prepare.DEPTH_LIMIT_M
 
@@ -63,7 +67,9 @@ def test_labels_are_read_only_where_asked_for(recording):
     usual = plain.PlainRecording(next(iter(recording._runs.values())).folder.parents[1])
     assert not schema.LABELS & usual.read(usual.sequences[0], 0).keys()
     with pytest.raises(schema.DataError, match="head 'depth' learns from depth_m"):
-        prepare.check_targets(CONFIG.model, usual.description)
+        prepare.check_targets(dataclasses.replace(CONFIG, loss=presets.tiny().loss), usual.description)
+    with pytest.raises(schema.DataError, match=r"loss\.image_instance is on and learns from image_instance_mask"):
+        prepare.check_targets(CONFIG, usual.description)
 
 
 def test_another_head_does_not_rename_the_recording():
@@ -87,6 +93,7 @@ def test_the_muvo_layout_gives_all_labels():
     assert raw.keys() >= schema.LABELS and len(recording.description.classes) == 23
     assert raw["depth_m"].shape == raw["image_classes"].shape == raw["image"].shape[:2]
     assert raw["point_classes"].shape == raw["points_m"].shape[:1]
+    np.testing.assert_array_equal(raw["image_instance_mask"], np.isin(raw["image_classes"], (4, 10)))
     plan, grid = raw["birds_eye_classes"], recording.description.voxels
     assert plan.shape == grid.shape[:2] and set(np.unique(plan)) <= {*range(8), 255}
     assert plan[grid.shape[0] // 2, grid.shape[1] // 2] in (1, 2)  # the ego stands on a road

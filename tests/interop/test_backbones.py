@@ -53,11 +53,11 @@ def test_every_encoder_starts_from_the_file_and_says_so(resnet, resnet_file):
     np.testing.assert_array_equal(params["fusion"]["combine"]["kernel"], fresh["params"]["fusion"]["combine"]["kernel"])
 
 
-def test_mobilevit_is_read_in_both_of_timms_spellings(tmp_path):
+def test_mobilevit_is_read_in_both_of_timms_spellings_and_from_within_a_wrapper(tmp_path):
     tensors = image_network("2d_mobilevit")
-    tensors = {key.replace("stages_", "stages."): value for key, value in tensors.items()}
+    tensors = {f"module.backbone.{key.replace('stages_', 'stages.')}": value for key, value in tensors.items()}
     path = tmp_path / "mobilevitv2_100.pth"
-    torch_writer.write_zip(path, torch_writer.tensors(tensors))
+    torch_writer.write_zip(path, {"state_dict": torch_writer.tensors(tensors), "epoch": 300})
     backbone = backbones.read(path)
     assert backbone.kind == "mobilevitv2_100"
     maps = jax.eval_shape(lambda: backbones.frozen_encoder(backbone).maps(jnp.zeros((1, 64, 128, 3))))
@@ -76,6 +76,10 @@ def test_a_file_that_does_not_fit_is_named_with_what_was_expected_and_found(resn
     with pytest.raises(backbones.BackboneError, match=r"short.*layer2.0.conv1.weight is \[64, 64, 3, 3\], the "
                                                       r"perceptual network expected \[128, 64, 3, 3\]"):
         backbones.frozen_encoder(backbones.read(tmp_path / "short.safetensors"))
+    two = {f"{student}.{key}": value for key, value in resnet.items() for student in ("student", "teacher")}
+    safetensors_file.save(tmp_path / "two.safetensors", two)
+    with pytest.raises(backbones.BackboneError, match=r"two.*expected one image network, found 2: resnet18 under"):
+        backbones.read(tmp_path / "two.safetensors")
     deeper, other = tmp_path / "resnet34.safetensors", tmp_path / "alexnet.safetensors"
     safetensors_file.save(deeper, resnet | {"layer1.2.conv1.weight": resnet["layer1.0.conv1.weight"]})
     with pytest.raises(backbones.BackboneError, match=r"resnet34.*1 are strange \(layer1.2.conv1.weight\)"):
@@ -94,6 +98,8 @@ def test_the_perceptual_term_needs_a_network_and_says_which(resnet_file):
     assert train.frozen_encoder(presets.tiny()) is None
     with pytest.raises(ValueError, match=r"train\.perceptual_from names no network"):
         train.frozen_encoder(train.configure(train.Options(preset="tiny", set=("loss.image_perceptual=0.1",)))[0])
+    with pytest.raises(ValueError, match=r"no head predicts any \(heads action\): add --with-heads=image"):
+        train.configure(train.Options(preset="tiny", heads="action", perceptual_from=resnet_file))
     with pytest.raises(ValueError, match="--backbone-weights and --init contradict"):
         train.configure(train.Options(backbone_weights=resnet_file, init=resnet_file.parent))
 

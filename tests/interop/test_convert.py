@@ -113,6 +113,16 @@ def test_a_checkpoint_without_tensors_and_an_occupied_folder(tmp_path):
     assert (tmp_path / "run" / "diary.txt").read_text() == "mine"
 
 
+def test_a_full_disk_is_named_and_leaves_no_folder(tmp_path, monkeypatch):
+    def full(*arguments, **settings):
+        raise RuntimeError("No space left on device")
+
+    monkeypatch.setattr(convert.checkpoint, "save_variables", full)
+    with pytest.raises(OSError, match=r"could not be written to .*new/run: RuntimeError: No space left"):
+        convert._write(tmp_path / "new" / "run", 0, {}, presets.get("tiny"), {"source": "a", "recognised": None})
+    assert not list(tmp_path.iterdir())
+
+
 @pytest.mark.slow
 def test_a_converted_run_is_judged_and_dreams(tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))

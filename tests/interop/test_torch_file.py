@@ -84,6 +84,43 @@ def test_damaged_and_foreign_files(tmp_path):
         torch_file.load(tmp_path / "nowhere.ckpt")
 
 
+def test_a_bit_that_flipped_and_a_bomb_are_refused(tmp_path):
+    path = tmp_path / "a.ckpt"
+    torch_writer.write_zip(path, torch_writer.tensors(ARRAYS))
+    content = bytearray(path.read_bytes())
+    content[content.index(ARRAYS["float32"].tobytes()) + 6] ^= 1
+    path.write_bytes(content)
+    with pytest.raises(torch_file.TorchFileError, match=r"a\.ckpt: .*Bad CRC-32 for file 'archive/data/0'"):
+        torch_file.load(path)
+    torch_writer.write_zip(path, {"x": torch_writer.Tensor(np.zeros(2**22, np.float32))}, zipfile.ZIP_DEFLATED)
+    with pytest.raises(torch_file.TorchFileError, match="would unpack to more than 64 times"):
+        torch_file.load(path)
+
+
+@pytest.mark.parametrize("stream", [
+    b"(S'x'\nios\nsystem\n.", b"(cos\nsystem\nX\1\0\0\0xo.", b"cbuiltins\ndict\n)\x81}X\1\0\0\0xcos\nsystem\nsb.",
+    b"(cos\nsystem\nX\1\0\0\0xtQ.", b"Pos.system\n.", b"\x82\1."],
+    ids=["inst", "obj", "build", "binpersid", "persid", "ext"])
+def test_no_opcode_reaches_code(stream, tmp_path):
+    with zipfile.ZipFile(tmp_path / "a.ckpt", "w") as archive:
+        archive.writestr("archive/data.pkl", b"\x80\x02" + stream)
+    with pytest.raises(torch_file.TorchFileError, match=r"asks for os\.system|refers to a str|unregistered extension"):
+        torch_file.load(tmp_path / "a.ckpt")
+
+
+def test_what_refers_to_itself_or_to_a_far_memo_is_read_once(tmp_path):
+    nested, circle = ["x"], []
+    for _ in range(40):
+        nested = [nested] * 10  # 10**40 strings, 41 lists
+    circle.append(circle)
+    torch_writer.write_zip(tmp_path / "a.ckpt", {"nested": nested, "circle": circle})
+    read = torch_file.load(tmp_path / "a.ckpt")
+    assert read["nested"][3] is read["nested"][7] and read["circle"][0] is read["circle"]
+    with zipfile.ZipFile(tmp_path / "b.ckpt", "w") as archive:
+        archive.writestr("archive/data.pkl", b"\x80\x02]r\xff\xff\xff\x7f.")  # 34 GB of memo in pickle's C form
+    assert torch_file.load(tmp_path / "b.ckpt") == []
+
+
 def test_a_tensor_beyond_its_storage_is_refused(tmp_path):
     far = torch_writer.Tensor(np.arange(4, dtype=np.float32), offset=2, shape=(3,))
     torch_writer.write_zip(tmp_path / "a.pt", collections.OrderedDict(x=far))
@@ -104,6 +141,15 @@ def test_safetensors_round_trip_and_damage(tmp_path):
     for damaged in (content[:-3], content[:5], b"x" * 40, struct.pack("<Q", len(bad_offsets)) + bad_offsets + bytes(8)):
         path.write_bytes(damaged)
         with pytest.raises(safetensors_file.SafetensorsError, match=r"w\.safetensors: expected a safetensors file"):
+            safetensors_file.load(path)
+    entry = lambda start: {"dtype": "F32", "shape": [2], "data_offsets": [start, start + 8]}
+    for header, data_bytes, message in (
+            ({"x": entry(0), "y": entry(4)}, 12, "y begins at byte 4 of the data, expected 8"),
+            ({"x": entry(0)}, 12, "its tensors have 8 bytes, the file has 12"),
+            ({"x": {"dtype": "F32", "shape": [-1, -2], "data_offsets": [0, 8]}}, 8, r"x has the shape \[-1, -2\]")):
+        encoded = json.dumps(header).encode()
+        path.write_bytes(struct.pack("<Q", len(encoded)) + encoded + bytes(data_bytes))
+        with pytest.raises(safetensors_file.SafetensorsError, match=message):
             safetensors_file.load(path)
     with pytest.raises(ValueError, match="no dtype complex64"):
         safetensors_file.save(path, {"x": np.zeros(2, np.complex64)})

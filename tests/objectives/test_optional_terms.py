@@ -2,6 +2,7 @@
 
 import dataclasses
 
+import golden_rule
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -9,8 +10,9 @@ import pytest
 
 from muvo_jax import config as config_lib
 from muvo_jax import types
+from muvo_jax.interop import packs, reference_preprocess
 from muvo_jax.nn import resnet
-from muvo_jax.objectives import classification, instances, perceptual, similarity, terms
+from muvo_jax.objectives import classification, instances, perceptual, similarity, terms, total
 
 MODEL, LOSS = config_lib.ModelConfig(), config_lib.LossConfig()
 ROWS, COLUMNS = 8, 16
@@ -92,6 +94,30 @@ def test_depth_is_learned_in_units_of_the_range_where_nothing_is_too():
     predictions = {f: jnp.full((1, 1, ROWS // f, COLUMNS // f, 1), -1.0) for f in (1, 2, 4)}
     got = values("depth", predictions, depth_m=depth_m)
     np.testing.assert_allclose(got["depth_1"], 100.0 / 50.0 / (ROWS * COLUMNS), rtol=1e-6)
+
+
+def test_image_terms_with_road_users_once_more_are_the_references():
+    """Golden entries rgb_1, rgb_2, rgb_4 (RGB_INSTANCE): 0.1/f * (L1 + 0.5 * L1 where vehicles and pedestrians are)."""
+    golden, draw = golden_rule.Golden("p5_losses_all_1d.npz"), packs.Settings(golden_rule.FOLDER).draw
+    image = reference_preprocess.crop(draw("full_image", (1, 2, 3, 600, 960), "image_u8"))
+    mask = reference_preprocess.crop(draw("pre_imask", (1, 2, 1, 600, 960), "mask"))[:, :, 0]
+    predictions = {f: np.moveaxis(draw(f"o_rgb_{f}", (1, 2, 3, 320 // f, 832 // f), "smooth"), 2, -1)
+                   for f in (1, 2, 4)}
+    batch = types.Batch(action=np.zeros((1, 2, 2), np.float32), is_first=np.zeros((1, 2), bool),
+                        image=np.moveaxis(image, 2, -1), image_instance_mask=mask)
+    gaussian = types.Gaussian(jnp.zeros((1, 2, 4)), jnp.ones((1, 2, 4)))
+    observed = types.Observed(types.LatentState(gaussian.mean, gaussian.mean), gaussian, gaussian)
+    model = dataclasses.replace(MODEL, heads=("image",))
+    loss = dataclasses.replace(LOSS, image=0.1, image_instance=0.05)
+    every = lambda batch: total.losses({"image": predictions}, batch, observed, model=model, loss=loss, keys=None)
+    got, expected = jax.jit(every)(batch), 0.0
+    for f in (1, 2, 4):
+        rgb = (0.1 * got[f"image_{f}"] + 0.05 * got[f"image_instance_{f}"]) / f
+        assert golden.error(f"loss/rgb_{f}", rgb) < 1e-5
+        expected += rgb
+    np.testing.assert_allclose(got["total"], expected, rtol=1e-6)
+    with pytest.raises(ValueError, match=r"loss\.image_instance is on, but the batch has no image_instance_mask"):
+        every(batch.replace(image_instance_mask=None))
 
 
 def test_the_perceptual_term_needs_a_frozen_network_and_vanishes_for_equal_pictures():

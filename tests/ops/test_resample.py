@@ -43,19 +43,6 @@ def test_upsampling_gradient_is_the_transpose_of_the_map(strict_dtypes):
     np.testing.assert_allclose(backward, forward.T, atol=1e-6)
 
 
-@pytest.mark.parametrize("size", [(3, 5), (8, 8), (5, 7), (13, 2), (1, 1)])
-def test_bilinear_resizing_agrees_with_jax_image(size, strict_dtypes):
-    x = jnp.asarray(np.random.default_rng(0).normal(size=(2, 5, 7, 3)), jnp.float32)
-    expected = jax.image.resize(x, (2, *size, 3), "linear", antialias=False)
-    np.testing.assert_allclose(resample.resize_bilinear(x, size), expected, atol=2e-6)
-
-
-def test_bilinear_resizing_takes_leading_axes_and_does_not_antialias(strict_dtypes):
-    x = jnp.arange(8.0)[None, None, None, :, None] * jnp.ones((2, 3, 1, 1, 1))
-    # Shrinking 8 to 2 reads positions 1.5 and 5.5, not means of four.
-    np.testing.assert_allclose(resample.resize_bilinear(x, (1, 2))[1, 2, 0, :, 0], [1.5, 5.5])
-
-
 def test_mean_pool_cascade_keeps_the_mean(strict_dtypes):
     x = jnp.asarray(np.random.default_rng(0).normal(size=(2, 3, 4, 8, 3)), jnp.float32)
     half = resample.mean_pool2(x)
@@ -64,17 +51,8 @@ def test_mean_pool_cascade_keeps_the_mean(strict_dtypes):
     np.testing.assert_allclose(resample.mean_pool2(half).mean((2, 3)), x.mean((2, 3)), atol=1e-6)
 
 
-def test_nearest_half_takes_even_indices_and_keeps_the_dtype():
-    x = np.arange(24, dtype=np.uint8).reshape(1, 4, 6)
-    half = resample.nearest_half(x, (1, 2))
-    assert isinstance(half, np.ndarray) and half.dtype == np.uint8
-    np.testing.assert_array_equal(half[0], [[0, 2, 4], [12, 14, 16]])
-
-
 def test_errors_name_what_came():
     with pytest.raises(ValueError, match="factor is 0"):
         resample.upsample_linear(jnp.zeros((1, 2, 2, 1)), 0)
     with pytest.raises(ValueError, match="3x4 pixels"):
         resample.mean_pool2(jnp.zeros((3, 4, 1)))
-    with pytest.raises(ValueError, match="two positive"):
-        resample.resize_bilinear(jnp.zeros((3, 4, 1)), (0, 2))

@@ -13,7 +13,7 @@ GRID = config_lib.VoxelGrid(shape=(8, 6, 4), voxel_size_m=0.5, origin_m=(-2.0, -
 
 def chords_m(start, end, grid):
     """Length of the segment inside every voxel, by clipping it to each box in float64."""
-    corner = voxels.voxel_centres(grid).astype(np.float64) - grid.voxel_size_m / 2
+    corner = np.moveaxis(np.indices(grid.shape), 0, -1) * grid.voxel_size_m + np.asarray(grid.origin_m)
     start, direction = np.asarray(start, np.float64), np.asarray(end, np.float64) - start
     direction = np.where(direction == 0, 1e-30, direction)
     low, high = (corner - start) / direction, (corner + grid.voxel_size_m - start) / direction

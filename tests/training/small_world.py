@@ -120,11 +120,11 @@ def make_config(accumulate=1, **model):
         augmentation=dataclasses.replace(config.augmentation, image=True),
         train=dataclasses.replace(config.train, batch=WINDOWS // accumulate, observe_frames=2, decode_frames=2),
         optimizer=dataclasses.replace(config.optimizer, accumulate=accumulate),
-        loss=dataclasses.replace(config.loss, image_squared=0.1, chamfer=0.1, chamfer_points=16))
+        loss=dataclasses.replace(config.loss, image_squared=0.1, image_instance=0.05, chamfer=0.1, chamfer_points=16))
 
 
 def make_batch(model_config, frames=3, seed=0):
-    """Random windows; window i has more holes and unknown voxels than window i - 1, and window 0 has none."""
+    """Random windows; window i has more holes, unknown voxels and masked pixels than i - 1, and window 0 has none."""
     generator = np.random.default_rng(seed)
     prefix, share = (WINDOWS, frames), np.linspace(0.0, 0.9, WINDOWS)
     rows, columns = model_config.range_view.rows, model_config.range_view.columns
@@ -142,4 +142,6 @@ def make_batch(model_config, frames=3, seed=0):
         image=generator.integers(0, 256, (*prefix, *model_config.image_size, 3), np.uint8),
         range_view=range_view, occupancy=occupancy,
         route_map=generator.integers(0, 2, (*prefix, 64, 64), np.uint8) * np.uint8(255),
-        speed_mps=generator.uniform(0, 10, prefix).astype(np.float32)).validate()
+        speed_mps=generator.uniform(0, 10, prefix).astype(np.float32),
+        image_instance_mask=generator.random((*prefix, *model_config.image_size)) < share[:, None, None, None],
+    ).validate()

@@ -23,7 +23,6 @@ from muvo_jax import config as config_lib
 from muvo_jax.data import recorder, schema
 from muvo_jax.data.town import settings
 from muvo_jax.data.town.simulator import WEATHER_NAMES, Town
-from muvo_jax.ops import camera as camera_ops
 
 fcntl: types.ModuleType | None
 try:
@@ -129,11 +128,8 @@ def record_town(directory: pathlib.Path | str, town_config: settings.TownConfig,
 
 def describe(directory: pathlib.Path, town_config: settings.TownConfig, splits: tuple[str, ...]) -> None:
     """Writes the recording's description."""
-    intrinsics = camera_ops.intrinsics_from_fov(town_config.camera_width_px, town_config.camera_height_px,
-                                                town_config.camera_fov_rad)
-    pose = camera_ops.level_camera_to_ego(town_config.lidar.position_m)
-    camera = schema.Camera(town_config.camera_width_px, town_config.camera_height_px,
-                           tuple(map(tuple, intrinsics.tolist())), tuple(map(tuple, pose.tolist())))
+    camera = schema.Camera.level(town_config.camera_width_px, town_config.camera_height_px, town_config.camera_fov_rad,
+                                 town_config.lidar.position_m)
     recorder.write_description(directory, name="town", rate_hz=town_config.contract.rate_hz, splits=splits,
                                contract=town_config.contract, camera=camera, lidar=town_config.lidar,
                                voxels=town_config.voxels)

@@ -14,10 +14,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from muvo_jax import types
-from muvo_jax.interop import reference_losses
 from muvo_jax.interop import reference_preprocess as preprocess
 from muvo_jax.interop.parity import cases, losses, raw_batch
-from muvo_jax.objectives import instances, kl, regression, scal
+from muvo_jax.objectives import instances, kl, perceptual, regression, scal, similarity
 
 Checks = Iterator[cases.Check]
 Terms = Iterator[tuple[str, Any]]
@@ -90,8 +89,8 @@ def _maps(context: cases.Context, labels: dict[str, np.ndarray], scale: int, lin
     of_instances = regression.l1_sums(_last(rgb), _last(target), _true(labels[f"image_instance_mask_{scale}"]))
     everywhere = regression.l1_sums(_last(rgb), _last(target))
     yield "rgb", weight * (everywhere.value() + _INSTANCE_WEIGHT * of_instances.value())
-    flat = [_last(picture).reshape(_FRAMES, *picture.shape[3:], 3) for picture in (rgb, target)]
-    yield "ssim", weight * _SIMILARITY_WEIGHT[line] * (1.0 - jax.jit(reference_losses.ssim)(*flat))
+    dissimilarity = jax.jit(similarity.dissimilarity_sums)(_last(rgb), _last(target))
+    yield "ssim", weight * _SIMILARITY_WEIGHT[line] * dissimilarity.value()
     if line == "2d":
         yield "perceptual", weight * _perceptual(rgb, target)
     view, returns = _last(output("lidar_reconstruction")), _last(labels[f"range_view_label_{scale}"])
@@ -101,8 +100,8 @@ def _maps(context: cases.Context, labels: dict[str, np.ndarray], scale: int, lin
             ("lidar_seg", "lidar_segmentation", "range_view_seg_label", _LIDAR_CLASSES),
             ("semantic_image", "semantic_image", "semantic_image_label", _IMAGE_CLASSES),
             ("bev_segmentation", "bev_segmentation", "birdview_label", _BIRDVIEW)):
-        logits, classes = losses.flat_frames(jnp.asarray(output(drawn)), jnp.asarray(labels[f"{label}_{scale}"]))
-        yield name, weight * reference_losses.cross_entropy(logits, classes, **options)
+        logits, classes = jnp.asarray(output(drawn)), jnp.asarray(labels[f"{label}_{scale}"])
+        yield name, weight * losses.cross_entropy(logits, classes, **options)
     yield "depth", weight * regression.l1_sums(_last(output("depth")), _last(labels[f"depth_label_{scale}"])).value()
     yield from _instances(output, labels, scale)
     yield from _occupancy(2 * _last(output("voxel")), labels[f"voxel_label_{scale}"][:, :, 0], weight, line)
@@ -138,7 +137,7 @@ def _occupancy(logits: jax.Array, target: np.ndarray, weight: float, line: str) 
 def _perceptual(prediction: np.ndarray, target: np.ndarray) -> jax.Array:
     network, weights = losses.perceptual_network((_FRAMES, *prediction.shape[3:], 3))
     maps = jax.jit(lambda weights, picture: losses.perceptual_maps(network, weights, picture))
-    return reference_losses.feature_distance(maps(weights, prediction), maps(weights, target), norm="l2", style=False)
+    return perceptual.distance_sums(maps(weights, prediction), maps(weights, target)).terms("distance")["distance"]
 
 
 GROUPS: tuple[cases.Group, ...] = (all_losses,)

@@ -84,11 +84,6 @@ def run(module, *args, prefix: str = "", where: str = "", rename: Callable[[str]
     return jax.jit(lambda variables, *inputs: module.apply(variables, *inputs, *static))(variables, *args)
 
 
-def run_method(module, method: Callable, variables: Any, *args) -> Any:
-    """Applies method(bound module, *args), jitted."""
-    return jax.jit(lambda variables, *inputs: module.apply(variables, *inputs, method=method))(variables, *args)
-
-
 def birds_eye_entries(prefix: str, scales: Mapping[int, jax.Array], axis: int) -> Iterator[tuple[str, np.ndarray]]:
     """The reference's three outputs for each scale of our head "birds_eye", channels at `axis`."""
     classes = heads.BIRDS_EYE_CLASSES

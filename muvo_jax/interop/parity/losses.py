@@ -6,7 +6,7 @@ of layout is part of what is differentiated.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import jax
@@ -14,13 +14,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from muvo_jax import types
-from muvo_jax.interop import reference_losses
 from muvo_jax.interop.parity import cases, drawing
 from muvo_jax.metrics import image as image_metrics
-from muvo_jax.metrics import points
+from muvo_jax.metrics import occupancy, points
 from muvo_jax.model import camera
 from muvo_jax.nn import resnet
-from muvo_jax.objectives import kl, regression, scal
+from muvo_jax.objectives import classification, kl, perceptual, regression, scal, similarity
 from muvo_jax.ops import nearest
 
 LOSS_TOLERANCE, GRADIENT_TOLERANCE = 1e-5, 1e-4
@@ -138,10 +137,36 @@ SEGMENTATION_WEIGHTS = (1.0, 1.0, 1.0, 2.0, 3.0, 1.0, 1.0, 1.0)
 PERCEPTUAL_TOLERANCES = (1e-4, 1e-3)
 
 
-def flat_frames(logits: jax.Array, target: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """[B, S, C, *grid] and [B, S, 1, *grid] -> [B S, P, C] and [B S, P]"""
-    flat = _last(logits).reshape(logits.shape[0] * logits.shape[1], -1, logits.shape[2])
-    return flat, target.reshape(flat.shape[:2])
+def cross_entropy(logits: jax.Array, target: jax.Array, **options: Any) -> jax.Array:
+    """Of logits [B, S, C, *grid] and classes [B, S, 1, *grid]; options of classification.cross_entropy_sums."""
+    return classification.cross_entropy_sums(_last(logits), target[:, :, 0], **options).value()
+
+
+def _dice(logits: jax.Array, target: jax.Array, *, epsilon: float, naive: bool) -> jax.Array:
+    """Of "not empty", arguments as `cross_entropy`."""
+    frames = logits.shape[0] * logits.shape[1]
+    filled, truth = 1.0 - jax.nn.softmax(logits, axis=2)[:, :, 0], (target[:, :, 0] != 0).astype(jnp.float32)
+    return classification.dice_sums(filled.reshape(frames, -1), truth.reshape(frames, -1), epsilon=epsilon,
+                                    naive=naive).value()
+
+
+def _affinity_sums(logits: jax.Array, target: jax.Array, chosen: list[int]) -> scal.OccupancySums:
+    """Where the classes `chosen` count as occupied and all others as empty; arguments as `cross_entropy`."""
+    others = [index for index in range(logits.shape[2]) if index not in chosen]
+    pair = [jax.nn.logsumexp(logits[:, :, np.array(classes)], axis=2) for classes in (others, chosen)]
+    return scal.occupancy_sums(jnp.stack(pair, axis=-1), jnp.where(target == IGNORED, IGNORED, jnp.isin(
+        target, np.array(chosen)))[:, :, 0])
+
+
+def _semantic_scal(logits: jax.Array, target: jax.Array) -> jax.Array:
+    """The affinity of each class against all others, averaged over the classes that occur."""
+    each = [scal.geometric_scal(_affinity_sums(logits, target, [index])) for index in range(logits.shape[2])]
+    occurs = jnp.stack([(target == index).any() for index in range(logits.shape[2])]).astype(jnp.float32)
+    return (jnp.stack(each) * occurs).sum() / jnp.maximum(occurs.sum(), 1.0)
+
+
+def _geometric_scal(logits: jax.Array, target: jax.Array) -> jax.Array:
+    return scal.geometric_scal(_affinity_sums(logits, target, list(range(1, logits.shape[2]))))
 
 
 def voxel_classes(context: cases.Context) -> Checks:
@@ -157,18 +182,15 @@ def voxel_classes(context: cases.Context) -> Checks:
             options["weighted"] = {"weights": VOXEL_WEIGHTS}
             options["weighted_topk0.5"] = {"weights": VOXEL_WEIGHTS, "top_share": 0.5}
         for tag, option in options.items():
-            loss = lambda *args, option=option: reference_losses.cross_entropy(*flat_frames(*args), **option)
+            loss = lambda *args, option=option: cross_entropy(*args, **option)
             yield from _loss(f"voxel_ce_c{classes}_{tag}", loss, logits, target)
         for epsilon, naive in ((1, True), (0.001, True), (0.001, False)):
-            loss = lambda *args, epsilon=epsilon, naive=naive: reference_losses.dice(
-                *flat_frames(*args), epsilon=epsilon, naive=naive)
+            loss = lambda *args, epsilon=epsilon, naive=naive: _dice(*args, epsilon=epsilon, naive=naive)
             yield from _loss(f"dice_c{classes}_eps{epsilon}_naive{int(naive)}", loss, logits, target)
         if classes == 9:  # two classes are the library's own terms, see scene_class_affinity
             for suffix in ("", "_ign"):
-                for term, function in (("sem_scal", reference_losses.semantic_scal),
-                                       ("geo_scal", reference_losses.geometric_scal)):
-                    loss = lambda *args, function=function: function(*flat_frames(*args))
-                    yield from _loss(f"{term}_c9{suffix}", loss, logits, draw(suffix))
+                for term, function in (("sem_scal", _semantic_scal), ("geo_scal", _geometric_scal)):
+                    yield from _loss(f"{term}_c9{suffix}", function, logits, draw(suffix))
 
 
 def segmentation(context: cases.Context) -> Checks:
@@ -181,22 +203,24 @@ def segmentation(context: cases.Context) -> Checks:
         logits = 3 * context.draw(f"{prefix}_pred", (2, 2, classes, *size), "pm1")
         target = context.draw(f"{prefix}_tgt", (2, 2, 1, *size), f"labels{classes}")
         options: dict[str, Any] = dict(option)
-        loss = lambda *args, options=options: reference_losses.cross_entropy(*flat_frames(*args), **options)
+        loss = lambda *args, options=options: cross_entropy(*args, **options)
         yield from _loss(name, loss, logits, target)
 
 
 def structural_similarity(context: cases.Context) -> Checks:
     prediction, target = _pictures(context)
 
-    def similarity(prediction, target, non_negative=False):
-        flat = lambda image: _last(image).reshape(-1, *image.shape[3:], 3)
-        return reference_losses.ssim(flat(prediction), flat(target), non_negative=non_negative)
+    def mean(prediction, target):
+        return similarity.frame_similarity(_last(prediction), _last(target)).mean()
 
-    yield from _loss("ssim", similarity, prediction, target)
-    yield from _loss("ssim_nonneg", lambda prediction, target: similarity(prediction, target, True), prediction, target)
-    window = np.broadcast_to(reference_losses.ssim_window(), (3, 1, 11, 11))
+    def mean_of_positive(prediction, target):
+        return jax.nn.relu(similarity.frame_similarity(_last(prediction), _last(target))).mean()
+
+    yield from _loss("ssim", mean, prediction, target)
+    yield from _loss("ssim_nonneg", mean_of_positive, prediction, target)
+    window = np.broadcast_to(similarity.window(), (3, 1, 11, 11))
     yield cases.Check("ssim_window", window, LOSS_TOLERANCE)
-    both = (similarity(prediction, target) + similarity(np.float32(0.9) * target, target)) / 2
+    both = (mean(prediction, target) + mean(np.float32(0.9) * target, target)) / 2
     yield cases.Check("metric_ssim_2batches", both, LOSS_TOLERANCE)
 
 
@@ -218,16 +242,27 @@ def class_scores(context: cases.Context) -> Checks:
         keep = (context.draw(f"ssc_mix{classes}", shape, "uniform") < 0.7) & (truth != IGNORED)
         prediction = np.where(keep, truth, context.draw(f"ssc_pred{classes}", shape, f"voxel{classes}"))
         nonempty = context.draw(f"ssc_ne{classes}", shape, "uniform") < 0.5
-        first = reference_losses.class_counts(prediction, truth, classes)
-        second = reference_losses.class_counts(prediction, np.where(truth == IGNORED, 0, truth), classes)
-        for tag, counts in (("batch1", first), ("batch2", first + second),
-                            ("nonempty", reference_losses.class_counts(prediction, truth, classes, nonempty))):
-            overall, each = reference_losses.class_scores(counts)
+        for tag, truths in (("batch1", [truth]), ("batch2", [truth, np.where(truth == IGNORED, 0, truth)]),
+                            ("nonempty", [np.where(nonempty, truth, IGNORED)])):
+            filled = _binary_scores(prediction, truths, range(1, classes))
+            # A class that nowhere occurs and is nowhere predicted counts as 0.
+            each = np.nan_to_num([_binary_scores(prediction, truths, [index])["iou_occ"] for index in range(classes)])
+            overall = np.array([*(filled[name] for name in ("precision", "recall", "iou_occ")), each[1:].mean()])
             yield cases.Check(f"ssc_c{classes}_{tag}", overall, LOSS_TOLERANCE)
             yield cases.Check(f"ssc_c{classes}_{tag}_perclass", each, LOSS_TOLERANCE)
 
 
-def perceptual(context: cases.Context) -> Checks:
+def _binary_scores(prediction: np.ndarray, truths: list[np.ndarray],
+                   chosen: Sequence[int]) -> dict[str, float]:
+    """Scores of occupancy over batches [N, *grid] of one prediction, where the classes `chosen` count as occupied."""
+    counts = occupancy.OccupancyCounts.zeros(1)
+    for truth in truths:
+        target = np.where(truth == IGNORED, IGNORED, np.isin(truth, chosen))
+        counts = counts.add(np.isin(prediction, chosen)[:, None], target[:, None], unknown_is_empty=False)
+    return {name: float(value[0]) for name, value in counts.scores().items()}
+
+
+def perceptual_distances(context: cases.Context) -> Checks:
     """Distances of a ResNet-18's maps of the normalised pictures. Its ReLUs are kinks of the gradient."""
     size = context.settings.size("p1", "perceptual_hw")
     prediction, target = (context.draw(f"perc_{side}", (1, 2, 3, *size), "smooth") for side in ("pred", "tgt"))
@@ -238,7 +273,9 @@ def perceptual(context: cases.Context) -> Checks:
     for name, norm, style in (("l2", "l2", False), ("l1", "l1", False), ("l2_style", "l2", True)):
         def distance(prediction, weights, norm=norm, style=style):
             features, wanted = (maps(picture, weights) for picture in (prediction, target))
-            return reference_losses.feature_distance(features, wanted, norm=norm, style=style)
+            if (norm, style) == ("l2", False):
+                return perceptual.distance_sums(features, wanted).terms("distance")["distance"]
+            return _feature_distance(features, wanted, jnp.abs if norm == "l1" else jnp.square, style)
 
         differentiate = jax.jit(jax.value_and_grad(distance))
         again = lambda differentiate=differentiate: (differentiate(prediction, moved)[1]
@@ -246,6 +283,20 @@ def perceptual(context: cases.Context) -> Checks:
         value, slope = differentiate(prediction, weights)
         yield cases.Check(f"perceptual_{name}/loss", value, PERCEPTUAL_TOLERANCES[0])
         yield cases.Check(f"perceptual_{name}/grad", slope, PERCEPTUAL_TOLERANCES[1], again=again)
+
+
+def _feature_distance(features: Any, wanted: Any, measure: Callable[[jax.Array], jax.Array], style: bool) -> jax.Array:
+    """The reference's other distances: sums over levels, of the maps and (style) of their Gram matrices, squared."""
+    pairs = list(zip(features, wanted, strict=True))
+    total = jnp.stack([measure(ours - theirs).mean() for ours, theirs in pairs]).sum()
+    if style:
+        total += jnp.stack([jnp.square(_gram(ours) - _gram(theirs)).mean() for ours, theirs in pairs]).sum()
+    return total
+
+
+def _gram(maps: jax.Array) -> jax.Array:
+    flat = maps.reshape(maps.shape[0], -1, maps.shape[-1])
+    return jnp.einsum("npc,npd->ncd", flat, flat) / (flat.shape[1] * flat.shape[2])
 
 
 def perceptual_network(shape: tuple[int, ...]) -> tuple[resnet.ResNet18, Any]:
@@ -272,4 +323,4 @@ def _pictures(context: cases.Context) -> tuple[np.ndarray, np.ndarray]:
 
 GROUPS: tuple[cases.Group, ...] = (
     divergence, regressions, spatial, scene_class_affinity, voxel_classes, segmentation, structural_similarity,
-    peak_signal_to_noise, chamfer, chamfer_metrics, class_scores, perceptual)
+    peak_signal_to_noise, chamfer, chamfer_metrics, class_scores, perceptual_distances)

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 import scipy.ndimage
 
-from muvo_jax.data import carla, carla_files, files, schema
+from muvo_jax.data import carla, carla_files, carla_runs, files, schema
 from muvo_jax.interop import packs
 from muvo_jax.interop.parity import cases
 from muvo_jax.ops import camera as camera_ops
@@ -50,7 +50,7 @@ class _Recordings:
         except (OSError, ValueError) as error:
             raise packs.PackError(f"{path}: expected the pointers of the pack ({error}).") from error
         self.config = self.expected["config"]
-        self.runs = carla.find_runs(context.recordings)
+        self.runs = carla_runs.find_runs(context.recordings)
 
 
 def batches(context: cases.Context) -> Checks:
@@ -71,7 +71,7 @@ def starts(frames: int, length: int, stride: int, skipped: int) -> range:
     return range(skipped, frames - stride * length)
 
 
-def pointers(runs: list[carla.Run], split: str, length: int, config: Mapping) -> list[list]:
+def pointers(runs: list[carla_runs.Run], split: str, length: int, config: Mapping) -> list[list]:
     """[run, frames] of every window of a split, in the authors' order; runs of little reward are left out."""
     stride, skipped = int(config["STRIDE_SEC"] * _ROWS_HZ), int(config["FILTER_BEGINNING"] * _ROWS_HZ)
     return [[_short(run), list(range(start, start + length * stride, stride))] for run in runs
@@ -79,7 +79,7 @@ def pointers(runs: list[carla.Run], split: str, length: int, config: Mapping) ->
             for start in starts(run.frames, length, stride, skipped)]
 
 
-def _short(run: carla.Run) -> str:
+def _short(run: carla_runs.Run) -> str:
     return run.name.removeprefix(f"{run.split}/")
 
 
@@ -113,7 +113,7 @@ def pointer_lists(context: cases.Context) -> Checks:
             yield _alone(name, bounds, theirs)
 
 
-def _data_module(runs: list[carla.Run], config: Mapping) -> dict[str, Any]:
+def _data_module(runs: list[carla_runs.Run], config: Mapping) -> dict[str, Any]:
     """Sizes of the authors' data module: all validation sets are its test set, every 50th window validates.
 
     The second and third validation sets are entered late, so that small ones give nothing.
@@ -144,9 +144,9 @@ def _batch(batch: str, described: Mapping, recordings: _Recordings) -> Checks:
             yield cases.Check(f"{batch}/{name}", ours, *_MEASURES.get(name, (0.0, _different)))
 
 
-def _read_frame(run: carla.Run, row: int, config: Mapping) -> dict[str, np.ndarray]:
+def _read_frame(run: carla_runs.Run, row: int, config: Mapping) -> dict[str, np.ndarray]:
     """One frame under the names and in the form of the authors' batches, all of their optional entries included."""
-    action = carla.actions(run)[row]
+    action = carla_runs.actions(run)[row]
     position_m = carla.LIDAR.position_m
     image = files.read_image(run.path("image", row), "RGB")
     depth, tags = carla_files.read_depth_semantic(run.path("depth_semantic", row))

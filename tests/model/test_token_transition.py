@@ -63,17 +63,17 @@ def test_heads_read_their_own_tokens_and_the_reference_s_alone():
     np.testing.assert_allclose(pooled[-24:], features[18])
 
 
-def test_the_cells_of_a_sensor_keep_their_places():
-    embedding = jnp.arange(1.0, 7 * 12 + 1).reshape(1, 7, 12)  # 2 cells of the image, 3 of a lidar, route, speed
-    image_alone = tokens.of_observation(embedding, dataclasses.replace(CONFIG, lidar="pp"))
-    assert image_alone.shape == (1, 19, 12)
-    np.testing.assert_array_equal(image_alone[:, :2], embedding[:, :2])
-    assert not image_alone[:, 2:].any()
-    embedding = jnp.arange(1.0, 13 * 12 + 1).reshape(1, 13, 12)  # 3 of a bird's-eye view, 8 of the range view, 2 measured
-    lidar_alone = tokens.of_observation(embedding, dataclasses.replace(CONFIG, camera="bev"))
-    np.testing.assert_array_equal(lidar_alone[:, 2:10], embedding[:, 3:11])
-    assert not lidar_alone[:, :2].any() and not lidar_alone[:, 10:].any()
-    assert not tokens.of_observation(embedding, dataclasses.replace(CONFIG, many_tokens=True)).any()
+def test_the_cells_of_a_sensor_keep_their_places_and_the_rest_gets_the_mean():
+    alone = lambda count, **changed: np.asarray(tokens.of_observation(
+        jnp.arange(1.0, count * 12 + 1).reshape(1, count, 12), dataclasses.replace(CONFIG, **changed)))
+    mean = lambda count: np.broadcast_to(np.arange(1.0, count * 12 + 1).reshape(count, 12).mean(axis=0), (19, 12))
+    image = alone(7, lidar="pp")[0]  # 2 cells of the image, 3 of a lidar, route, speed
+    np.testing.assert_array_equal(image[:2], np.arange(1.0, 25).reshape(2, 12))
+    np.testing.assert_allclose(image[2:], mean(7)[2:], rtol=1e-6)
+    lidar = alone(13, camera="bev")[0]  # 3 cells of a bird's-eye view, 8 of the range view, route, speed
+    np.testing.assert_array_equal(lidar[2:10], np.arange(1.0, 157).reshape(13, 12)[3:11])
+    np.testing.assert_allclose(np.delete(lidar, slice(2, 10), 0), np.delete(mean(13), slice(2, 10), 0), rtol=1e-6)
+    np.testing.assert_allclose(alone(13, many_tokens=True)[0], mean(13), rtol=1e-6)
 
 
 def test_aligned_tokens_start_where_they_stand():

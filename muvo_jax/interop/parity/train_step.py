@@ -168,9 +168,9 @@ def _update(context: cases.Context, params: Any, gradients: Any) -> Checks:
 def _signed(pack: packs.Pack, path: tuple[Any, ...], gradient: jax.Array) -> np.ndarray:
     """A gradient of ours with the pack's in the places where ours does not decide the step.
 
-    Adam's first step is gradient / (|gradient| + epsilon), as long as the learning rate whatever the gradient's size. Its
-    direction is unknown where a gradient is smaller than its own tolerance, its length where one is near epsilon. There
-    the step of the pack's gradient is compared; the gradients themselves are entries of their own.
+    Adam's first step is gradient / (|gradient| + epsilon), as long as the learning rate whatever the gradient's size.
+    Its direction is unknown where a gradient is smaller than its own tolerance, its length where one is near epsilon.
+    There the step of the pack's gradient is compared; the gradients themselves are entries of their own.
     """
     ours = "/".join(part.key for part in path)
     key, entry = names.reference_key(ours), f"grad/{names.reference_key(ours)}"

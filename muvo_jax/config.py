@@ -293,6 +293,11 @@ class TrainConfig:
     backbone_weights: str = ""
     perceptual_from: str = ""
 
+    def __post_init__(self):
+        for name in ("steps", "batch"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"train.{name} is {getattr(self, name)}; it must be at least 1.")
+
 
 @dataclasses.dataclass(frozen=True)
 class EvaluationConfig:

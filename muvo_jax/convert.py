@@ -11,6 +11,7 @@ import sys
 import tempfile
 from typing import Annotated, Any
 
+import numpy as np
 import tyro
 
 from muvo_jax import command_line, presets
@@ -69,6 +70,8 @@ def convert(options: Options, show: screen.Screen) -> checkpoints.Stored:
               "latent": model.latent, "facts": dict(stored.facts), "mapped": match.mapped, "ignored": ignored,
               "missing": match.missing, "unexpected": match.unexpected, "wrong_shape": match.misshapen}
     _write(options.out, step, names.convert_state_dict(stored.state_dict, model), config, report)
+    if broken := [key for key in match.mapped if not np.isfinite(stored.state_dict[key]).all()]:
+        show.warn(f"{options.checkpoint}: {len(broken)} of its weights hold NaN or infinity, such as {broken[0]}.")
     show.line(f"{len(match.mapped)} keys mapped, {len(ignored)} ignored (why: {options.out / REPORT_FILE})")
     show.line(f"wrote {options.out}, numerics={model.numerics}")
     return stored

@@ -7,7 +7,7 @@ import itertools
 import pathlib
 import shlex
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Annotated, Any
 
 import numpy as np
@@ -138,8 +138,9 @@ def configure(options: Options) -> tuple[config_lib.Config, dict[str, Any], path
         raise ValueError("--resume and --init contradict each other: a resumed run has weights of its own.")
     options = dataclasses.replace(options, **{flag: getattr(options, flag).lower() for flag in _ANY_CASE
                                               if getattr(options, flag) is not None})
-    chosen = (_variant_settings(options) | _network_settings(options) | command_line.chosen_settings(options, _FIELDS)
-              | command_line.parse_settings(options.set))
+    settings = command_line.parse_settings(options.set)
+    chosen = (_variant_settings(options, settings) | _network_settings(options)
+              | command_line.chosen_settings(options, _FIELDS) | settings)
     base = presets.get(options.preset or "town")
     folder = options.runs_dir / (options.name or default_name(options))
     if options.resume:
@@ -168,11 +169,11 @@ def configure(options: Options) -> tuple[config_lib.Config, dict[str, Any], path
     return base, chosen, folder
 
 
-def _variant_settings(options: Options) -> dict[str, str]:
+def _variant_settings(options: Options, settings: Mapping[str, Any]) -> dict[str, str]:
     """{"model.lidar": "pp", ...} from --variant=PP-BEV-FC.
 
     Raises:
-      ValueError: for a name that does not exist, or another flag that contradicts it.
+      ValueError: for a name that does not exist, or another flag or one of --set's `settings` that contradicts it.
     """
     if options.variant is None:
         return {}
@@ -182,9 +183,11 @@ def _variant_settings(options: Options) -> dict[str, str]:
         raise ValueError(f"--variant={options.variant} is unknown; known are {', '.join(known)}.")
     parts = dict(zip(("lidar", "camera", "fusion"), options.variant.lower().split("-"), strict=True))
     for flag, value in parts.items():
-        if getattr(options, flag) not in (None, value):
-            raise ValueError(f"--variant={options.variant} and --{flag}={getattr(options, flag)} contradict "
-                             f"each other: give one of them.")
+        for name, other in ((f"--{flag}", getattr(options, flag)),
+                            (f"--set model.{flag}", settings.get(f"model.{flag}"))):
+            if other not in (None, value):
+                raise ValueError(f"--variant={options.variant} and {name}={other} contradict each other: give one of "
+                                 f"them.")
     return {f"model.{flag}": value for flag, value in parts.items()}
 
 

@@ -98,6 +98,7 @@ def test_an_unknown_option_names_its_neighbours(capsys):
      "reference-1d, reference-2d, reference-mobilevit. Did you mean town?"),
     (["--fusion=tt"], "model.fusion: 'tt' is unknown; known are tr"),
     (["--variant=PP-FC"], "--variant=PP-FC is unknown; known are RV-WOB-TR"),
+    (["--variant=PP-BEV-FC", "--set", "model.fusion=tr"], "--set model.fusion=tr contradict each other"),
     (["--variant=PP-BEV-FC", "--lidar=rv"], "--variant=PP-BEV-FC and --lidar=rv contradict each other"),
     (["--fusion=avg", "--latent=2d"], "the 2D latent is made of tokens, and only tr keeps tokens"),
     (["--occupancy", "--no-occupancy"], "contradict each other"),

@@ -39,6 +39,7 @@ def test_override_changes_one_field_and_leaves_the_rest():
     ("model.birds_eye.lifted_bins", 99, "lifted_bins 99 lie between 1 and depth_bins"),
     ("model.image_size", [32, 256], "multiples of 64"),
     ("data.stride", 0, "data.stride is 0; it must be at least 1"),
+    ("train.steps", 0, "train.steps is 0; it must be at least 1"),
     ("train.parallel", "pmapp", "Did you mean pmap"),
 ])
 def test_bad_values_are_refused_with_the_reason(field, value, message):

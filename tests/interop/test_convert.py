@@ -12,10 +12,10 @@ import torch_writer
 
 import muvo_jax
 from muvo_jax import config as config_lib
-from muvo_jax import convert, dream, evaluate, presets
+from muvo_jax import convert, dream, evaluate, presets, train
 from muvo_jax.interop import checkpoints, export_torch, names, packs, safetensors_file, weights_rule
 from muvo_jax.model import world_model
-from muvo_jax.training import screen
+from muvo_jax.training import checkpoint, screen
 
 # The tiny preset, with two things that no checkpoint tells as they are by default.
 TINY = dataclasses.replace(presets.get("tiny").model, numerics="reference", transformer_heads=8, token_channels=24,
@@ -113,6 +113,15 @@ def test_a_checkpoint_without_tensors_and_an_occupied_folder(tmp_path):
     assert (tmp_path / "run" / "diary.txt").read_text() == "mine"
 
 
+def test_weights_that_are_not_finite_are_said(tmp_path, capsys):
+    state_dict = names.reference_state_dict(drawn_variables(TINY), TINY)
+    state_dict["policy.fc.6.bias"] = np.array([np.nan, 0.0], np.float32)
+    torch_writer.write_zip(tmp_path / "a.ckpt", checkpoint_of(state_dict))
+    run_convert(tmp_path / "a.ckpt", tmp_path / "run")
+    printed = " ".join("".join(capsys.readouterr()).split())
+    assert "1 of its weights hold NaN or infinity, such as policy.fc.6.bias" in printed
+
+
 def test_a_full_disk_is_named_and_leaves_no_folder(tmp_path, monkeypatch):
     def full(*arguments, **settings):
         raise RuntimeError("No space left on device")
@@ -124,7 +133,7 @@ def test_a_full_disk_is_named_and_leaves_no_folder(tmp_path, monkeypatch):
 
 
 @pytest.mark.slow
-def test_a_converted_run_is_judged_and_dreams(tmp_path, monkeypatch):
+def test_a_converted_run_is_judged_dreams_and_trains_on(tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     state_dict = names.reference_state_dict(drawn_variables(TINY), TINY)
     torch_writer.write_zip(tmp_path / "a.ckpt", checkpoint_of(state_dict))
@@ -134,6 +143,9 @@ def test_a_converted_run_is_judged_and_dreams(tmp_path, monkeypatch):
     assert "val_rl" in json.dumps(judged) and (tmp_path / "run" / "evaluation.json").exists()
     drawn = dream.dream(dream.Options(tmp_path / "run", context=2, horizon=2), screen.Screen())
     assert {path.suffix for path in drawn} == {".gif", ".png"} and all(path.stat().st_size for path in drawn)
+    train.train(train.Options(preset="tiny", init=tmp_path / "run", name="more", runs_dir=tmp_path, steps=1, batch=1,
+                              evaluate=False), screen.Screen())
+    assert checkpoint.load_run(tmp_path / "more").config.model == checkpoint.load_run(tmp_path / "run").config.model
 
 
 @pytest.mark.slow

@@ -255,7 +255,7 @@ def _heads(options: Options, heads: Sequence[str]) -> tuple[str, ...] | None:
 
 def default_name(options: Options) -> str:
     """Such as town-tr, tiny-pp-bev-fc or kitti_raw-tr-2d."""
-    settings = _variant_settings(options)
+    settings = _variant_settings(options, {})
     lidar, camera, fusion = (getattr(options, flag) or settings.get(f"model.{flag}", usual)
                              for flag, usual in (("lidar", "rv"), ("camera", "wob"), ("fusion", "tr")))
     parts = [options.preset or "town", fusion if (lidar, camera) == ("rv", "wob") else f"{lidar}-{camera}-{fusion}"]

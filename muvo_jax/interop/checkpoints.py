@@ -20,7 +20,6 @@ from muvo_jax import config as config_lib
 from muvo_jax.interop import safetensors_file, torch_file
 
 _PREFIX = "model."
-_MOST_INFLATION = 64
 _LARGEST_SIZE = 2**13  # of an axis that tells a size; the released models have 2048
 _BESIDE = {
     r"^preprocess\.": "constants of the preprocessing",
@@ -77,7 +76,7 @@ def read(path: str | os.PathLike) -> Stored:
         raise CheckpointMismatch(f"{path}: expected a checkpoint with tensors by name (a state_dict), found {held}.")
     tensors = {str(key): value for key, value in tensors.items() if isinstance(value, np.ndarray)}
     wanted_bytes, file_bytes = sum(value.nbytes for value in tensors.values()), path.stat().st_size
-    if wanted_bytes > _MOST_INFLATION * file_bytes:  # views that repeat few numbers, or a bomb
+    if wanted_bytes > torch_file.MOST_INFLATION * file_bytes:  # views that repeat few numbers, or a bomb
         raise CheckpointMismatch(f"{path}: expected tensors of about the size of the file, found that those in its "
                                  f"{file_bytes} bytes would take {wanted_bytes}.")
     beside = {key: reason for key in tensors

@@ -42,7 +42,7 @@ _PLAIN_BUILTINS = {kind.__name__: kind
 _LEGACY_MAGIC = 0x1950A86A20F9469CFC6C
 _LEGACY_PROTOCOL = 1001
 # torch.save does not compress; who zips a checkpoint anew gains little. More than this is a bomb.
-_MOST_INFLATION, _INFLATION_SLACK_BYTES = 64, 2**20
+MOST_INFLATION, _INFLATION_SLACK_BYTES = 64, 2**20
 _EXPECTED = "expected a checkpoint of torch.save (a Lightning .ckpt, or a state_dict in a .pth file)"
 
 
@@ -236,12 +236,12 @@ class _Members:
     def __init__(self, archive: zipfile.ZipFile, path: pathlib.Path):
         self.names = {info.filename: info for info in archive.infolist()}
         self._archive, self._mapped = archive, np.memmap(path, np.uint8, mode="r")
-        self._bytes_left = _MOST_INFLATION * self._mapped.size + _INFLATION_SLACK_BYTES
+        self._bytes_left = MOST_INFLATION * self._mapped.size + _INFLATION_SLACK_BYTES
 
     def read(self, name: str) -> bytes:
         self._bytes_left -= self.names[name].file_size
         if self._bytes_left < 0:
-            raise TorchFileError(f"it would unpack to more than {_MOST_INFLATION} times its {self._mapped.size} bytes")
+            raise TorchFileError(f"it would unpack to more than {MOST_INFLATION} times its {self._mapped.size} bytes")
         return self._archive.read(name)
 
     def data(self, name: str, size: int) -> np.ndarray:

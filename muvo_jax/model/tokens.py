@@ -74,4 +74,5 @@ def of_observation(embedding: jax.Array, config: ModelConfig) -> jax.Array:
         placed["range_view"] = embedding[..., lidar_ends - sizes["range_view"]:lidar_ends, :]
     whole = embedding.mean(axis=-2, keepdims=True)
     spread = lambda size: jnp.broadcast_to(whole, (*whole.shape[:-2], size, whole.shape[-1]))
-    return jnp.concatenate([placed.get(group, spread(size)) for group, size in sizes.items()], axis=-2)
+    parts = [placed[group] if group in placed else spread(size) for group, size in sizes.items()]
+    return jnp.concatenate(parts, axis=-2)

@@ -23,7 +23,8 @@ class Check:
       stands_alone: whether the expected value lies elsewhere than in the pack (in `measure`).
       again: the same value on weights that differ by rounding (drawing.rounded_anew), asked for only where `got` misses
         the tolerance. At a kink of the function it is chance on which side float32 comes out, in the reference too, so
-        one of these may be its value. Of a smooth one this gives the mean, from which our own rounding is gone.
+        one of these may be its value. Of a smooth one this gives the mean over such weights (drawing.rounded_in_pairs),
+        from which our own rounding is gone.
     """
 
     entry: str

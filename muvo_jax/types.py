@@ -158,16 +158,67 @@ class Gaussian(_Indexable):
 
 
 @flax.struct.dataclass
+class Motion(_Indexable):
+    """The car in the ego frame of an earlier moment (x forward, y left).
+
+    Attributes:
+      pose: float32 [..., 3], x (m), y (m), yaw (rad, counter-clockwise).
+      speed_mps: float32 [...].
+    """
+
+    pose: Array
+    speed_mps: Array
+
+
+@flax.struct.dataclass
+class Vantage(_Indexable):
+    """Where a state stands to what was observed: how decoders know from where they look at a Memory.
+
+    Attributes:
+      motion: Motion [...], the car in the ego frame of the memory's newest observation.
+      first: int32 [...], the memory's first observation that belongs to this drive.
+      last: int32 [...], the newest one that this state has seen.
+      steps: int32 [...], imagined since then; at 0 the state is that of the observation `last` itself, which its
+        decoders must not look up: their guess comes from the observations before it.
+    """
+
+    motion: Motion
+    first: Array
+    last: Array
+    steps: Array
+
+
+@flax.struct.dataclass
+class Memory(_Indexable):
+    """The last F observations as they came and where they were taken; held once, without axes of time or branches.
+
+    Attributes:
+      pose: float32 [B, F, 3], x, y, yaw of each in the ego frame of the newest, which is the last one.
+      range_view: float32 [B, F, Hr, Wr, 4], as Batch.range_view; None for a model without lidar.
+      image: uint8 [B, F, H, W, 3], as Batch.image; None for a model without camera.
+      intrinsics, camera_to_ego: float32 [B, 3, 3] and [B, 4, 4]; None without image.
+    """
+
+    pose: Array
+    range_view: Array | None = None
+    image: Array | None = None
+    intrinsics: Array | None = None
+    camera_to_ego: Array | None = None
+
+
+@flax.struct.dataclass
 class LatentState(_Indexable):
     """What the world model knows: the carry of the recurrence, for training, imagination, planning and live use.
 
     Attributes:
       deterministic: float32 [..., D], the recurrent state h; tokens [..., N, C] with the 2D latent.
       stochastic: float32 [..., S], the sampled state s; tokens [..., N, C] with the 2D latent.
+      vantage: Vantage [...] of a model that keeps track of its motion (ModelConfig.tracks_motion), else None.
     """
 
     deterministic: Array
     stochastic: Array
+    vantage: Vantage | None = None
 
     @property
     def features(self) -> Array:
@@ -202,11 +253,13 @@ class Observed(_Indexable):
       states: LatentState [B, T, ...], each with its posterior's sample, which is what decoders read (under the RSSM
         dropout of training, the recurrence itself may have gone on from the prior's).
       posterior, prior: Gaussian [B, T, S].
+      memory: Memory [B, ...] of the window, for a model with first_guess="last_seen"; `decode` takes it.
     """
 
     states: LatentState
     posterior: Gaussian
     prior: Gaussian
+    memory: Memory | None = None
 
     @property
     def last(self) -> LatentState:

@@ -11,16 +11,16 @@ import jax.numpy as jnp
 import numpy as np
 
 import muvo_jax
-from muvo_jax.agents import kinematics
+from muvo_jax.ops import motion as motion_ops
 from muvo_jax.training import checkpoint
 
 
 def path(steps):
     """Poses [B, H, 3] that steps [B, H, 4] lead to."""
-    motion = kinematics.at_rest_of_frame(jnp.zeros(steps.shape[0]))
+    motion = motion_ops.at_rest_of_frame(jnp.zeros(steps.shape[0]))
     poses = []
     for index in range(steps.shape[1]):
-        motion = kinematics.moved(motion, steps[:, index])
+        motion = motion_ops.moved(motion, steps[:, index])
         poses.append(motion.pose)
     return np.stack(poses, axis=1)
 
@@ -49,8 +49,8 @@ def main():
     paths = {"head": path(learned["ego_motion"][1]),
              "the last observed motion going on": path(np.repeat(last[:, None], steps.shape[1], axis=1))}
     if run.config.contract.kinematics == "bicycle":
-        motion = kinematics.at_rest_of_frame(jnp.asarray(last[:, 3]))
-        paths["bicycle"] = kinematics.path(motion, jnp.asarray(batch.action[:, context - 1:-1]), run.config.contract,
+        motion = motion_ops.at_rest_of_frame(jnp.asarray(last[:, 3]))
+        paths["bicycle"] = motion_ops.path(motion, jnp.asarray(batch.action[:, context - 1:-1]), run.config.contract,
                                            run.config.data.stride).pose
     truth = path(steps)
     away = {name: np.linalg.norm(poses[:, -1, :2] - truth[:, -1, :2], axis=-1).mean() for name, poses in paths.items()}

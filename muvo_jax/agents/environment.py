@@ -17,10 +17,11 @@ import jax
 import jax.numpy as jnp
 
 from muvo_jax import config as config_lib
-from muvo_jax.agents import kinematics, rewards
+from muvo_jax.agents import rewards
 from muvo_jax.model import checks
 from muvo_jax.model.world_model import WorldModel
-from muvo_jax.types import Array, Batch, LatentState, Observed, Variables
+from muvo_jax.ops import motion as motion_ops
+from muvo_jax.types import Array, Batch, LatentState, Motion, Observed, Variables
 
 ACTION_CHANNELS = checks.ACTION_CHANNELS
 RewardFunction = Callable[[rewards.Moment], tuple[Array, Array, dict[str, Array]]]
@@ -75,7 +76,7 @@ class EnvState:
     """
 
     latent: LatentState
-    motion: kinematics.Motion
+    motion: Motion
     start: Array
     time: Array
     reward: Array
@@ -184,7 +185,7 @@ class Environment:
     def reset(self, key: Array, params: EnvParams) -> tuple[Any, EnvState]:
         """Draws a start from the bank: (observation, state)."""
         start = jax.random.randint(key, (), 0, params.bank.size)
-        state = EnvState(params.bank.latent[start], kinematics.at_rest_of_frame(params.bank.speed_mps[start]),
+        state = EnvState(params.bank.latent[start], motion_ops.at_rest_of_frame(params.bank.speed_mps[start]),
                          start, jnp.int32(0), jnp.float32(0), jnp.bool_(False))
         return self.observe(state, params), state
 
@@ -204,9 +205,9 @@ class Environment:
         full, for_reward = self._decode(params.variables, latent.features)
         motion = state.motion
         if self.ego_path == "bicycle":
-            motion = kinematics.drive(motion, action, self.contract, self.periods)
+            motion = motion_ops.drive(motion, action, self.contract, self.periods)
         elif self.ego_path == "ego_motion":
-            motion = kinematics.moved(motion, full["ego_motion"])
+            motion = motion_ops.moved(motion, full["ego_motion"])
         route_map = None if params.bank.route_map is None else params.bank.route_map[state.start]
         moment = rewards.Moment(state.motion, motion, action, latent.features, for_reward, route_map)
         reward, terminated, terms = self._reward(moment)

@@ -11,9 +11,10 @@ from worlds import CONFIG, HORIZON, bank
 from muvo_jax import config as config_lib
 from muvo_jax import types
 from muvo_jax.agents import environment as environment_lib
-from muvo_jax.agents import kinematics, rewards
+from muvo_jax.agents import rewards
 from muvo_jax.model import rollout, world_model
 from muvo_jax.objectives import terms, total
+from muvo_jax.ops import motion as motion_ops
 
 LEARNED = ("reward", "continue", "ego_motion")
 MODEL = world_model.WorldModel(dataclasses.replace(CONFIG, heads=LEARNED))
@@ -53,7 +54,7 @@ def test_without_kinematics_the_path_is_the_heads(variables):
     decoded = rollout.decode(MODEL, variables, states.latent, LEARNED)
     motion = state.motion
     for step in decoded["ego_motion"][1]:
-        motion = kinematics.moved(motion, step)
+        motion = motion_ops.moved(motion, step)
     np.testing.assert_allclose(states.motion.pose[-1], motion.pose, atol=1e-5)
     np.testing.assert_allclose(states.motion.speed_mps[-1], motion.speed_mps, atol=1e-5)
     np.testing.assert_allclose(transitions.reward, decoded["reward"][1][:, 0], atol=1e-5)
@@ -61,15 +62,15 @@ def test_without_kinematics_the_path_is_the_heads(variables):
 
 
 def test_a_step_of_the_head_is_composed_with_the_heading_of_the_car():
-    motion = kinematics.Motion(jnp.array([1.0, 2.0, jnp.pi / 2]), jnp.float32(3.0))
-    after = kinematics.moved(motion, jnp.array([2.0, 0.5, 0.1, 4.0]))
+    motion = types.Motion(jnp.array([1.0, 2.0, jnp.pi / 2]), jnp.float32(3.0))
+    after = motion_ops.moved(motion, jnp.array([2.0, 0.5, 0.1, 4.0]))
     np.testing.assert_allclose(after.pose, [0.5, 4.0, np.pi / 2 + 0.1], atol=1e-6)
     assert after.speed_mps == 4.0
 
 
 def test_comfort_without_a_bicycle_is_that_of_the_motion():
-    before = kinematics.Motion(jnp.array([0.0, 0.0, 0.0]), jnp.float32(9.0))
-    after = kinematics.moved(before, jnp.array([2.0, 0.0, 0.03, 10.0]))
+    before = types.Motion(jnp.array([0.0, 0.0, 0.0]), jnp.float32(9.0))
+    after = motion_ops.moved(before, jnp.array([2.0, 0.0, 0.03, 10.0]))
     moment = rewards.Moment(before, after, jnp.zeros(2), jnp.zeros(3), {})
     got = rewards.discomfort(moment, CARLA.contract, 0.2, rewards.RewardConfig(comfortable_mps2=3.0))
     np.testing.assert_allclose(got, ((1.0 / 0.2) ** 2 + (10.0 * 0.03 / 0.2) ** 2) / 9.0, rtol=1e-5)

@@ -184,7 +184,7 @@ def film(loaded: checkpoint.LoadedRun, town: simulator.Town, drive: closed_loop.
     views = []
     for latent in (states, jax.tree.map(lambda leaf: leaf[:, -1], dreamt.states)):
         decoded = rollout.decode(model, variables, latent, heads)
-        frames = jax.device_get(protocol.finish({head: scales[1] for head, scales in decoded.items()}))
+        frames = jax.device_get(protocol.finish(decoded))
         views.append(sheets.views_of_frames({head: value[None] for head, value in frames.items()}, 0))
     scene = sheets.Scene.of(loaded.config)
     pictures = []

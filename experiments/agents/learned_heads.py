@@ -42,11 +42,11 @@ def main():
     reward = batch.reward[:, context:]
     error = lambda value: np.abs(value - reward).mean()
     print(f"reward of {reward.size} imagined frames, mean absolute error: "
-          f"head {error(learned['reward'][1][..., 0]):.3f}, "
+          f"head {error(learned.reward[..., 0]):.3f}, "
           f"the last observed reward {error(batch.reward[:, context - 1:context]):.3f}, "
           f"their mean {error(reward.mean()):.3f}")
     last, steps = batch.ego_motion[:, context - 1], batch.ego_motion[:, context:]
-    paths = {"head": path(learned["ego_motion"][1]),
+    paths = {"head": path(learned.ego_motion),
              "the last observed motion going on": path(np.repeat(last[:, None], steps.shape[1], axis=1))}
     if run.config.contract.kinematics == "bicycle":
         motion = kinematics.at_rest_of_frame(jnp.asarray(last[:, 3]))

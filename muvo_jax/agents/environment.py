@@ -232,10 +232,10 @@ class Environment:
         names = self.decoded_heads if heads is None else heads
         if not names:
             return {}, {}
-        scales = self.model.decode(variables, features, names)
-        full = {name: scales[name][1] for name in names}
+        predictions = self.model.decode(variables, features, names)
+        full = {name: predictions[name] for name in names}
         return full, full if "occupancy" not in names else {
-            **full, "occupancy": scales["occupancy"][self.reward_config.occupancy_scale]}
+            **full, "occupancy": predictions.at_scale(self.reward_config.occupancy_scale).occupancy}
 
     def _observe(self, features: Array, decoded: dict[str, Array]) -> Any:
         if self.observation == "features":

@@ -182,7 +182,7 @@ def learned_policy(model: WorldModel, variables: Variables) -> Policy:
 
 def _decode_action(model, variables, key, features):
     del key
-    return model.decode(variables, features, ("action",))["action"][1]
+    return model.decode(variables, features, ("action",)).action
 
 
 def _fold_each(key, count):

@@ -29,12 +29,13 @@ def test_their_loss_terms_by_hand():
     motion = jnp.array([[[9.0, 9.0, 9.0, 5.0], [1.0, 0.1, 0.05, 10.0]]])
     batch = types.Batch(jnp.zeros((1, 2, 2)), jnp.array([[True, False]]), reward=jnp.array([[0.5, -1.0]]),
                         is_terminal=jnp.array([[False, True]]), ego_motion=motion)
-    predictions = {"reward": {1: jnp.array([[[0.0], [0.0]]])}, "continue": {1: jnp.array([[[0.0], [2.0]]])},
-                   "ego_motion": {1: jnp.zeros((1, 2, 4))}}
+    predictions = types.Predictions({
+        "reward": {1: jnp.array([[[0.0], [0.0]]])}, "continue": {1: jnp.array([[[0.0], [2.0]]])},
+        "ego_motion": {1: jnp.zeros((1, 2, 4))}})
     values, loss = {}, config_lib.LossConfig()
     for head in LEARNED:
         total.check_head(head, predictions, batch, MODEL.config, loss)
-        sums = terms.TABLE[head].sums(terms.Inputs(predictions[head], batch, MODEL.config, loss,
+        sums = terms.TABLE[head].sums(terms.Inputs(predictions.scales(head), batch, MODEL.config, loss,
                                                    jax.random.split(jax.random.key(0), 1)))
         values |= {name: float(value) for part, found in sums.items() for name, value in found.terms(part).items()}
     want = {"reward": (0.25 + 1.0) / 2, "continue": (np.log(2) + np.log1p(np.exp(2))) / 2,
@@ -52,12 +53,12 @@ def test_without_kinematics_the_path_is_the_heads(variables):
     states, transitions = environment_lib.play(world, params, jax.random.key(1), state, plan, HORIZON)
     decoded = rollout.decode(MODEL, variables, states.latent, LEARNED)
     motion = state.motion
-    for step in decoded["ego_motion"][1]:
+    for step in decoded.ego_motion:
         motion = kinematics.moved(motion, step)
     np.testing.assert_allclose(states.motion.pose[-1], motion.pose, atol=1e-5)
     np.testing.assert_allclose(states.motion.speed_mps[-1], motion.speed_mps, atol=1e-5)
-    np.testing.assert_allclose(transitions.reward, decoded["reward"][1][:, 0], atol=1e-5)
-    np.testing.assert_array_equal(transitions.terminated, decoded["continue"][1][:, 0] < 0)
+    np.testing.assert_allclose(transitions.reward, decoded.reward[:, 0], atol=1e-5)
+    np.testing.assert_array_equal(transitions.terminated, decoded["continue"][:, 0] < 0)
 
 
 def test_a_step_of_the_head_is_composed_with_the_heading_of_the_car():

@@ -116,14 +116,14 @@ def test_a_policy_drives_from_the_features(variables, state):
 def test_the_learned_policy_is_the_action_head(variables, state):
     dream = rollout.imagine(MODEL, variables, jax.random.key(2), state, rollout.learned_policy(MODEL, variables),
                             horizon=2)
-    np.testing.assert_allclose(dream.actions[:, 0], rollout.decode(MODEL, variables, state, ("action",))["action"][1],
+    np.testing.assert_allclose(dream.actions[:, 0], rollout.decode(MODEL, variables, state, ("action",)).action,
                                atol=1e-6)
 
 
 def test_gradients_reach_actions_and_the_start_state(variables, state, actions):
     def target(actions, state):
         dream = rollout.imagine(MODEL, variables, jax.random.key(3), state, actions)
-        return rollout.decode(MODEL, variables, dream.states[:, -1], ("action",))["action"][1].sum()
+        return rollout.decode(MODEL, variables, dream.states[:, -1], ("action",)).action.sum()
 
     by_action, by_state = jax.grad(target, argnums=(0, 1))(actions, state)
     # The action does not enter the recurrence, but its sample does: every step counts.
@@ -242,7 +242,7 @@ def test_forward_mode_reaches_decoded_images_with_plain_convolutions(variables, 
 
     def image(scale):
         dream = rollout.imagine(plain, variables, jax.random.key(0), state, scale * actions, sampled=False)
-        return rollout.decode(plain, variables, dream.states[:, -1], ("image",))["image"][4].sum()
+        return rollout.decode(plain, variables, dream.states[:, -1], ("image",)).at_scale(4).image.sum()
 
     _, tangent = jax.jit(lambda scale: jax.jvp(image, (scale,), (jnp.ones(()),)))(jnp.float32(0.5))
     np.testing.assert_allclose(tangent, jax.jit(jax.grad(image))(jnp.float32(0.5)), rtol=1e-3)

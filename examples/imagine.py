@@ -8,8 +8,9 @@ import jax.numpy as jnp
 import muvo_jax
 
 
-def main(run: str) -> None:
-    model, variables = muvo_jax.load(run)
+def main(folder: str) -> None:
+    run = muvo_jax.load(folder)
+    model, variables = run.model, run.variables
     batch = muvo_jax.windows(run, count=2)
     past = batch.time_slice(0, batch.frames // 2)
 

@@ -58,7 +58,7 @@ def test_predictions_are_read_by_name_at_full_size_or_another():
 
 def test_a_head_or_scale_that_is_not_there_is_named_with_those_that_are():
     decoded = predictions()
-    with pytest.raises(AttributeError, match="Predictions.depth: the head 'depth' was not decoded; these were"):
+    with pytest.raises(AttributeError, match=r"Predictions.depth: the head 'depth' was not decoded; these were"):
         _ = decoded.depth
     with pytest.raises(KeyError, match="was not decoded; these were: image, continue"):
         _ = decoded["depth"]

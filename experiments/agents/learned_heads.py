@@ -12,7 +12,6 @@ import numpy as np
 
 import muvo_jax
 from muvo_jax.agents import kinematics
-from muvo_jax.training import checkpoint
 
 
 def path(steps):
@@ -30,9 +29,9 @@ def main():
     parser.add_argument("run")
     parser.add_argument("--windows", type=int, default=32)
     options = parser.parse_args()
-    run = checkpoint.load_run(options.run)
+    run = muvo_jax.load(options.run)
     context = run.config.data.context
-    batch = muvo_jax.windows(options.run, count=options.windows)
+    batch = muvo_jax.windows(run, count=options.windows)
     seen = batch.time_slice(0, context)
     observed = muvo_jax.observe(run.model, run.variables, jax.random.key(0), seen, sampled=False)
     dream = muvo_jax.imagine(run.model, run.variables, jax.random.key(0), observed.last,

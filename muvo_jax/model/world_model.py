@@ -216,9 +216,9 @@ class WorldModel:
           heads: which ones; None for all that the model has. Only these are computed.
 
         Returns:
-          Predictions, float32 [..., *size / scale, channels]: image in [0, 1] where trained (no clipping), range_view in
-          metres, occupancy as logits [..., X, Y, Z, 2], action in (-1, 1) [..., 2], at full size only; what other heads
-          return, model/heads.py says.
+          Predictions, float32 [..., *size / scale, channels]: image in [0, 1] where trained (no clipping), range_view
+          in metres, occupancy as logits [..., X, Y, Z, 2], action in (-1, 1) [..., 2], at full size only; what other
+          heads return, model/heads.py says.
 
         Raises:
           ValueError: for a head that the model does not have, or features of another shape.

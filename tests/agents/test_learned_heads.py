@@ -14,6 +14,7 @@ from muvo_jax.agents import environment as environment_lib
 from muvo_jax.agents import kinematics, rewards
 from muvo_jax.model import rollout, world_model
 from muvo_jax.objectives import terms, total
+from muvo_jax.run import Run
 
 LEARNED = ("reward", "continue", "ego_motion")
 MODEL = world_model.WorldModel(dataclasses.replace(CONFIG, heads=LEARNED))
@@ -45,7 +46,7 @@ def test_their_loss_terms_by_hand():
 
 
 def test_without_kinematics_the_path_is_the_heads(variables):
-    world = environment_lib.make(MODEL, CARLA, learned_reward=True)
+    world = environment_lib.Environment.of_run(Run(MODEL, {}, CARLA), learned_reward=True)
     assert world.ego_path == "ego_motion" and world.decoded_heads == LEARNED
     params = world.params(variables, bank(), HORIZON)
     _, state = world.reset(jax.random.key(0), params)
@@ -84,4 +85,4 @@ def test_comfort_without_a_bicycle_is_that_of_the_motion():
 def test_a_head_that_the_run_did_not_train_is_named(heads, options, message):
     blind = world_model.WorldModel(dataclasses.replace(CONFIG, heads=heads))
     with pytest.raises(ValueError, match=message):
-        environment_lib.make(blind, CARLA, **options)
+        environment_lib.Environment.of_run(Run(blind, {}, CARLA), **options)

@@ -95,6 +95,35 @@ def test_imagine_equals_a_loop_by_hand(variables, state, actions):
         assert_close((dream.states[:, step], dream.prior[:, step]), (current, prior))
 
 
+def test_imagine_is_imagine_step_again_and_again(variables, state, actions):
+    keys = jax.random.split(jax.random.key(4), BATCH)
+    fold = jax.vmap(jax.random.fold_in, (0, None))
+    for options in ({}, {"temperature": 0.5}, {"sampled": False}):
+        dream = rollout.imagine(MODEL, variables, keys, state, actions, **options)
+        current = state
+        for step in range(HORIZON):
+            current = rollout.imagine_step(MODEL, variables, fold(fold(keys, step), 0), current, actions[:, step],
+                                           **options)
+        assert_close(dream.states[:, -1], current)
+
+
+def test_imagine_step_takes_any_leading_axes_and_compiles_once(variables, state, actions):
+    step = lambda key, state, action: rollout.imagine_step(MODEL, variables, key, state, action)
+    one = step(jax.random.key(1), state[0], actions[0, 0])
+    assert one.stochastic.shape == (CONFIG.stochastic_channels,)
+    before = rollout._imagine_one._cache_size()
+    for seed in (2, 3):
+        other = step(jax.random.key(seed), state[0], actions[0, 1])
+    assert rollout._imagine_one._cache_size() == before and not np.allclose(one.stochastic, other.stochastic)
+    keys = jax.random.split(jax.random.key(4), BATCH)
+    many = jax.vmap(step)(keys, state, actions[:, 0])
+    assert_close(many, step(jax.vmap(jax.random.fold_in, (0, None))(keys, 0), state, actions[:, 0]))
+    with pytest.raises(ValueError, match=r"imagine_step: got action \[2\], expected \[2, 2\]"):
+        step(jax.random.key(1), state, actions[0, 0])
+    with pytest.raises(ValueError, match="reach from 3 to 3"):
+        step(jax.random.key(1), state, jnp.full((BATCH, 2), 3.0))
+
+
 def test_branches_are_independent_futures(variables, state, actions):
     fan = jnp.stack([actions, -actions, actions], axis=1)
     dream = rollout.imagine(MODEL, variables, jax.random.key(1), state, fan, sampled=False)

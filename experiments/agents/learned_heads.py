@@ -12,7 +12,6 @@ import numpy as np
 
 import muvo_jax
 from muvo_jax.ops import motion as motion_ops
-from muvo_jax.training import checkpoint
 
 
 def path(steps):
@@ -30,9 +29,9 @@ def main():
     parser.add_argument("run")
     parser.add_argument("--windows", type=int, default=32)
     options = parser.parse_args()
-    run = checkpoint.load_run(options.run)
+    run = muvo_jax.load(options.run)
     context = run.config.data.context
-    batch = muvo_jax.windows(options.run, count=options.windows)
+    batch = muvo_jax.windows(run, count=options.windows)
     seen = batch.time_slice(0, context)
     observed = muvo_jax.observe(run.model, run.variables, jax.random.key(0), seen, sampled=False)
     dream = muvo_jax.imagine(run.model, run.variables, jax.random.key(0), observed.last,
@@ -42,11 +41,11 @@ def main():
     reward = batch.reward[:, context:]
     error = lambda value: np.abs(value - reward).mean()
     print(f"reward of {reward.size} imagined frames, mean absolute error: "
-          f"head {error(learned['reward'][1][..., 0]):.3f}, "
+          f"head {error(learned.reward[..., 0]):.3f}, "
           f"the last observed reward {error(batch.reward[:, context - 1:context]):.3f}, "
           f"their mean {error(reward.mean()):.3f}")
     last, steps = batch.ego_motion[:, context - 1], batch.ego_motion[:, context:]
-    paths = {"head": path(learned["ego_motion"][1]),
+    paths = {"head": path(learned.ego_motion),
              "the last observed motion going on": path(np.repeat(last[:, None], steps.shape[1], axis=1))}
     if run.config.contract.kinematics == "bicycle":
         motion = motion_ops.at_rest_of_frame(jnp.asarray(last[:, 3]))

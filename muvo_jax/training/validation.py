@@ -9,6 +9,7 @@ import jax
 import numpy as np
 
 from muvo_jax import config as config_lib
+from muvo_jax import run as run_lib
 from muvo_jax import types
 from muvo_jax.data import pipeline, prepare, schema, sources
 from muvo_jax.metrics import baselines, protocol
@@ -60,10 +61,10 @@ def windows(frames: pipeline.Frames, split: str, count: int) -> Iterator[tuple[t
     return ((entry.batch, entry.count) for entry in pipeline.evaluation_batches(frames, split, windows=count))
 
 
-def windows_of_run(run: str | os.PathLike, split: str | None = None, *, count: int,
+def windows_of_run(run: run_lib.Run | str | os.PathLike, split: str | None = None, *, count: int,
                    frames: int | None = None) -> types.Batch:
     """See muvo_jax.windows."""
-    config = checkpoint.load_run(run).config
+    config = (run if isinstance(run, run_lib.Run) else checkpoint.load_run(run)).config
     recording = sources.open_configured(config)
     held_out = [name for name in recording.description.splits if name != "train"]
     split = split or (held_out or ["train"])[0]

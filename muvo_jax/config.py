@@ -54,6 +54,14 @@ class ActionContract:
 
 
 @dataclasses.dataclass(frozen=True)
+class Kinematics:
+    """How one step of a model moves the car: the contract's bicycle for `periods` recorded periods."""
+
+    contract: ActionContract = ActionContract()
+    periods: int = 1
+
+
+@dataclasses.dataclass(frozen=True)
 class ModelConfig:
     """The network. Defaults are the paper's size and the released 1D model (RV-WOB-TR with occupancy).
 
@@ -64,6 +72,7 @@ class ModelConfig:
       heads: what is decoded, of config_heads.TARGETS; a modality that the data lacks has no head.
       semantic_classes: of the heads semantic_image and semantic_range_view, as the recording counts them.
       route, speed: whether the planned route and the speed are inputs.
+      route_encoder: a ResNet-18 as in the paper, which is larger than a small preset's whole transition, or "small".
       navigation: whether the route's command, the next one and the GPS targets are inputs.
       backbone: of image and range view; pillars, route and the maps of fc and avg keep a ResNet-18.
       many_tokens: fusion "tr" sees the finest maps, 16 times as many tokens (the reference's LARGE).
@@ -89,6 +98,13 @@ class ModelConfig:
       occupancy_token_stages: doublings at full width of the 2D latent's voxel decoder; the voxel tokens are a grid of
         shape / 2**(stages + 3).
       first_guess: "training_mean": decoders draw the difference from the average training frame; see model/outputs.py.
+        "last_seen": from what the sensors showed of late, moved by the motion of the car, and from the average where
+        that covers nothing; see model/memory.py.
+      memory_frames: so many observations are remembered for that.
+      guided_channels: widths of the decoders of image, range view and occupancy that see the memory.
+      action_path: "prior": actions reach the prior and the posterior only, as in the paper. "recurrence": they and the
+        step that they cause enter the recurrence too, and the start of every token.
+      kinematics: what actions do, where they describe the motion; Config fills it in from contract and stride.
       range_view_points: "beams": x, y, z are drawn as the difference from the point along the pixel's beam.
       compute_dtype: of the matrix work; parameters, norms, softmax and losses stay float32.
       convolution: "auto" takes the forms of ops/conv.py that are fast on this backend, "xla" the plain ones (needed for
@@ -105,6 +121,7 @@ class ModelConfig:
     semantic_classes: int = 10
     route: bool = True
     speed: bool = True
+    route_encoder: Literal["resnet18", "small"] = "resnet18"
     navigation: bool = False
     backbone: str = "resnet18"
     many_tokens: bool = False
@@ -134,12 +151,21 @@ class ModelConfig:
     occupancy_channels: int = 64
     occupancy_blocks: int = 3
     occupancy_token_stages: int = 1
-    first_guess: Literal["zero", "training_mean"] = "zero"
+    first_guess: Literal["zero", "training_mean", "last_seen"] = "zero"
+    memory_frames: int = 6
+    guided_channels: tuple[int, int, int] = (64, 64, 64)
+    action_path: Literal["prior", "recurrence"] = "prior"
+    kinematics: Kinematics | None = None
     range_view_points: Literal["free", "beams"] = "free"
     compute_dtype: Literal["float32", "bfloat16"] = "float32"
     convolution: Literal["auto", "xla", "gemm"] = "auto"
     range_scale_m: float = 50.0
     speed_scale_mps: float = 5.0
+
+    @property
+    def tracks_motion(self) -> bool:
+        """Whether states know where the car is and how fast (LatentState.vantage)."""
+        return self.first_guess == "last_seen" or (self.action_path == "recurrence" and self.kinematics is not None)
 
     @property
     def variant(self) -> str:
@@ -271,6 +297,8 @@ class TrainConfig:
       decode_frames: how many frames of a window are decoded in a training step, drawn anew each time; 0 means all.
       observe_frames: so many frames of a training window are observed, the rest imagined from the last of them; 0
         observes all.
+      restart: the observed frames of a training window are cut in two at a frame drawn anew in each step, so that the
+        filter is trained on 1 to observe_frames of them.
       parallel: "auto" uses shard_map over all devices where there is more than one.
       backbone_weights: file of an image network that fresh encoders start from; "" for none.
       perceptual_from: such a file, or a run whose image encoder is taken, for the perceptual term; "" for none.
@@ -290,6 +318,7 @@ class TrainConfig:
     remat: bool = False
     decode_frames: int = 0
     observe_frames: int = 0
+    restart: bool = False
     backbone_weights: str = ""
     perceptual_from: str = ""
 
@@ -331,6 +360,13 @@ class Config:
     train: TrainConfig = TrainConfig()
     evaluation: EvaluationConfig = EvaluationConfig()
     contract: ActionContract = ActionContract()
+
+    def __post_init__(self):
+        needed = self.model.first_guess == "last_seen" or self.model.action_path == "recurrence"
+        known = needed and self.contract.kinematics == "bicycle"
+        wanted = Kinematics(self.contract, self.data.stride) if known else None
+        if self.model.kinematics != wanted:  # one truth: contract and stride
+            object.__setattr__(self, "model", dataclasses.replace(self.model, kinematics=wanted))
 
     @property
     def targets(self) -> dict[str, tuple[int, ...]]:

@@ -68,8 +68,8 @@ def _coerce(hint, value, path: str):
         inner = arguments[:1] * len(value) if arguments[-1] is Ellipsis else arguments
         if len(inner) == len(value):
             return tuple(_coerce(kind, item, path) for kind, item in zip(inner, value, strict=True))
-    if origin is types.UnionType and value is None and type(None) in arguments:
-        return None
+    if origin is types.UnionType and type(None) in arguments:
+        return None if value is None else _coerce(arguments[0], value, path)
     if hint is float and isinstance(value, int) and not isinstance(value, bool):
         return float(value)
     if isinstance(hint, type) and isinstance(value, hint) and (hint is bool or not isinstance(value, bool)):

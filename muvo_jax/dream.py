@@ -128,7 +128,7 @@ def dream_window(model: world_model.WorldModel, variables: types.Variables, key:
     for branch in range(branches):
         states = jax.tree.map(lambda seen, dreamt, branch=branch: jnp.concatenate([seen, dreamt[:, branch]], axis=1),
                               observed.states, imagined.states)
-        decoded = rollout.decode(model, variables, states, heads)
+        decoded = rollout.decode(model, variables, states, heads, memory=observed.memory)
         futures.append(jax.device_get(protocol.finish(decoded)))
     return futures
 

@@ -47,7 +47,10 @@ def town() -> config_lib.Config:
         occupancy_channels=32,
         occupancy_blocks=0,
         occupancy_token_stages=0,
-        first_guess="training_mean",
+        first_guess="last_seen",
+        guided_channels=(64, 64, 64),
+        action_path="recurrence",
+        route_encoder="small",
         range_view_points="beams",
     )
     return config_lib.Config(
@@ -57,8 +60,8 @@ def town() -> config_lib.Config:
                                    occupancy_cross_entropy=3.0, occupancy_semantic_scal=0.05,
                                    occupancy_geometric_scal=0.05, action=0.2, kl=5e-4),
         optimizer=config_lib.OptimizerConfig(learning_rate=2e-3, warmup_fraction=0.1, clip_norm=10.0),
-        data=config_lib.DataConfig(frames=8),
-        train=config_lib.TrainConfig(steps=460, batch=12, decode_frames=1, observe_frames=3, validate_every=230,
+        data=config_lib.DataConfig(frames=12),
+        train=config_lib.TrainConfig(steps=460, batch=12, decode_frames=1, observe_frames=6, restart=True, validate_every=230,
                                      checkpoint_every=230, preview_every=460, validation_windows=8),
         evaluation=config_lib.EvaluationConfig(windows=32),
     )

@@ -97,7 +97,7 @@ def prepare_frame(raw: schema.RawFrame, config: config_lib.Config) -> PreparedFr
         ready |= {name: raw[name] for name in NAVIGATION}  # type: ignore[literal-required]
     if model.route:
         ready["route_map"] = raw["route_map"]
-    if model.speed:
+    if model.speed or model.kinematics is not None:
         ready["speed_mps"] = raw["speed_mps"]
     for name in ("reward", "is_terminal", *(config.targets.keys() - _ALWAYS_THERE - _MADE_OF.keys())):
         if name in raw:

@@ -8,9 +8,13 @@ from typing import Any
 import flax.struct
 import numpy as np
 
+import jax
+
 from muvo_jax import types
+from muvo_jax.ops import resample
 
 Frames = dict[str, np.ndarray]
+COARSE_SCALES = (2, 4)
 
 
 def copy_last(batch: types.Batch, context: int, horizon: int) -> tuple[Frames, int]:
@@ -49,19 +53,23 @@ class TrainingMean:
       image: float64 [H, W, 3], sum of pixel values 0..255.
       range_view: float64 [Hr, Wr, 4], sum over the frames in which the pixel has a return.
       returned: int64 [Hr, Wr], how many these are.
-      occupied, known: int64 [X, Y, Z], frames in which the voxel is occupied, and in which it is not unknown.
+      occupied, known: {scale: int64 [X / scale, Y / scale, Z / scale]}, frames in which the voxel is occupied, and in
+        which it is not unknown; coarse voxels as they are trained (objectives/labels.py).
+      action: float64 [2], sum of squares.
     """
 
     frames: int = 0
     image: np.ndarray | None = None
     range_view: np.ndarray | None = None
     returned: np.ndarray | None = None
-    occupied: np.ndarray | None = None
-    known: np.ndarray | None = None
+    occupied: dict[int, np.ndarray] | None = None
+    known: dict[int, np.ndarray] | None = None
+    action: np.ndarray | None = None
 
     def add(self, batch: types.Batch) -> TrainingMean:
         """With all frames of a batch."""
-        sums: dict[str, Any] = {"frames": batch.batch_size * batch.frames}
+        sums: dict[str, Any] = {"frames": batch.batch_size * batch.frames,
+                                "action": np.square(np.asarray(batch.action, np.float64)).sum(axis=(0, 1))}
         if batch.image is not None:
             sums["image"] = np.asarray(batch.image).sum(axis=(0, 1), dtype=np.float64)
         if batch.range_view is not None:
@@ -70,12 +78,17 @@ class TrainingMean:
             sums["range_view"] = np.where(returned[..., None], range_view, 0.0).sum(axis=(0, 1), dtype=np.float64)
             sums["returned"] = returned.sum(axis=(0, 1), dtype=np.int64)
         if batch.occupancy is not None:
-            occupancy = np.asarray(batch.occupancy)
-            sums["occupied"] = (occupancy == types.OCCUPANCY_OCCUPIED).sum(axis=(0, 1), dtype=np.int64)
-            sums["known"] = (occupancy != types.OCCUPANCY_UNKNOWN).sum(axis=(0, 1), dtype=np.int64)
+            coarse = {1: np.asarray(batch.occupancy)}
+            for scale in COARSE_SCALES:
+                if not any(side % 2 for side in coarse[scale // 2].shape[2:]):
+                    coarse[scale] = resample.pool_occupancy(coarse[scale // 2])
+            count = lambda mask: mask.sum(axis=(0, 1), dtype=np.int64)
+            sums["occupied"] = {scale: count(value == types.OCCUPANCY_OCCUPIED) for scale, value in coarse.items()}
+            sums["known"] = {scale: count(value != types.OCCUPANCY_UNKNOWN) for scale, value in coarse.items()}
         before = {name: getattr(self, name) for name in sums}
-        return dataclasses.replace(self, **{name: value if before[name] is None else before[name] + value
-                                            for name, value in sums.items()})
+        return dataclasses.replace(self, **{
+            name: value if before[name] is None else jax.tree.map(np.add, before[name], value)
+            for name, value in sums.items()})
 
     def prediction(self) -> Frames:
         """The mean frame: {"image": float32 [H, W, 3] in [0, 1], "range_view": float32 [Hr, Wr, 4], "occupancy": bool}.
@@ -98,5 +111,5 @@ class TrainingMean:
             values = self.range_view / np.maximum(self.returned, 1)[..., None]
             mean["range_view"] = np.where(returns[..., None], values, hole).astype(np.float32)
         if self.occupied is not None and self.known is not None:
-            mean["occupancy"] = 2 * self.occupied > self.known
+            mean["occupancy"] = 2 * self.occupied[1] > self.known[1]
         return mean

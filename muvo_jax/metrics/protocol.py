@@ -60,7 +60,7 @@ def _predict(model, variables, key, batch, context, horizon, sampled):
     dream = rollout.imagine(model, variables, key_imagine, observed.last, actions, sampled=sampled)
     states = jax.tree.map(lambda *parts: jax.numpy.concatenate(parts, axis=1), observed.states, dream.states)
     heads = shown_heads(model.config)
-    return finish(model.decode(variables, states.features, heads))
+    return finish(model.decode(variables, states, heads, observed.memory))
 
 
 def shown_heads(config: config_lib.ModelConfig) -> tuple[str, ...]:

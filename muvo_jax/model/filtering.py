@@ -4,11 +4,13 @@ A subclass says how the state moves and how it looks at actions and observations
 
     state_shapes(config)                              shapes of h and s of one sample
     initial_constants(config)                         first values of some parameters
-    recur(state)                             -> h'    the recurrence
-    predict(h', action, keys)                -> prior
-    infer(h', embedding, action, keys)       -> posterior
+    recur(state, effect)                         -> h'    the recurrence
+    predict(h', action, effect, keys)            -> prior
+    infer(h', embedding, action, effect, keys)   -> posterior
 
-As in the reference the action enters the prior and the posterior, not the recurrence. Differs from the reference in
+As in the reference the action enters the prior and the posterior. With action_path="recurrence" what it does, its
+`effect`, enters everything: a prior that reads one action among many tokens learns to ignore it. Differs from the
+reference in
 the slope of the leaky ReLUs, 0.01 here and 1 there (numerics="reference"), and in drawing the RSSM dropout's coin per
 sample instead of per batch.
 """
@@ -23,12 +25,15 @@ import numpy as np
 from flax import linen
 
 from muvo_jax.config import ModelConfig
-from muvo_jax.types import Gaussian, LatentState, StepNoise
+from muvo_jax.model import memory
+from muvo_jax.nn import layers
+from muvo_jax.types import Gaussian, LatentState, Motion, StepNoise
 
 LEAKY_SLOPE = {"standard": 0.01, "reference": 1.0}
 # A fresh model's raw standard deviation: 2 sigmoid(-4 / 2) + 0.1 = 0.34. At 0, which gives 1.1, the noise of the first
 # steps hides what the latent says, and it is long ignored. Trained weights bring their own.
 _INITIAL_RAW_STD = -4.0
+_STEP_UNITS = (1.0, 0.1, 0.05, 0.5, 5.0)  # forward m, left m, turn rad, gained m/s, m/s: about 1 in a town at 5 Hz
 
 
 def gaussian(moments: jax.Array) -> Gaussian:
@@ -64,36 +69,55 @@ class Transition(linen.Module, abc.ABC):
         """Path of a parameter below "transition" -> its first value."""
 
     @abc.abstractmethod
-    def recur(self, state: LatentState) -> jax.Array:
-        """The next deterministic state."""
+    def recur(self, state: LatentState, effect: jax.Array | None) -> jax.Array:
+        """The next deterministic state; effect [B, E] of the action, None where action_path is "prior"."""
 
     @abc.abstractmethod
-    def predict(self, deterministic: jax.Array, action: jax.Array, keys: jax.Array | None) -> Gaussian:
+    def predict(self, deterministic: jax.Array, action: jax.Array, effect: jax.Array | None,
+                keys: jax.Array | None) -> Gaussian:
         """The prior; keys [B] switch dropout on."""
 
     @abc.abstractmethod
-    def infer(self, deterministic: jax.Array, embedding: jax.Array, action: jax.Array,
+    def infer(self, deterministic: jax.Array, embedding: jax.Array, action: jax.Array, effect: jax.Array | None,
               keys: jax.Array | None) -> Gaussian:
         """The posterior; keys [B] switch dropout on."""
 
     @classmethod
     def initial_state(cls, config: ModelConfig, batch_size: int) -> LatentState:
         """The zero state, [batch_size, ...], before anything was seen."""
-        return LatentState(*(jnp.zeros((batch_size, *shape), jnp.float32) for shape in cls.state_shapes(config)))
+        vantage = memory.initial_vantage(config, batch_size) if config.tracks_motion else None
+        return LatentState(*(jnp.zeros((batch_size, *shape), jnp.float32) for shape in cls.state_shapes(config)),
+                           vantage)
 
     def observe_step(self, noise: StepNoise, action: jax.Array, state: LatentState, embedding: jax.Array,
                      is_first: jax.Array) -> tuple[LatentState, tuple[Gaussian, Gaussian]]:
-        """One step with an observation; see WorldModel.observe_step."""
+        """One step with an observation; see WorldModel.observe_step. The vantage is left to whoever observed."""
         state = jax.tree.map(lambda leaf: where(is_first, jnp.zeros_like(leaf), leaf), state)
         action = where(is_first, jnp.zeros_like(action), action)
-        deterministic = self.recur(state)
-        prior = self.predict(deterministic, action, noise.dropout)
-        posterior = self.infer(deterministic, embedding, action, noise.dropout)
+        effect, _ = self.effect(action, state)
+        deterministic = self.recur(state, effect)
+        prior = self.predict(deterministic, action, effect, noise.dropout)
+        posterior = self.infer(deterministic, embedding, action, effect, noise.dropout)
         stochastic = where(noise.use_prior & ~is_first, prior.sample(noise.prior), posterior.sample(noise.posterior))
-        return LatentState(deterministic, stochastic), (prior, posterior)
+        return state.replace(deterministic=deterministic, stochastic=stochastic), (prior, posterior)
 
     def imagine_step(self, noise: jax.Array, action: jax.Array, state: LatentState) -> tuple[LatentState, Gaussian]:
         """One step without an observation; see WorldModel.imagine_step."""
-        deterministic = self.recur(state)
-        prior = self.predict(deterministic, action, None)
-        return LatentState(deterministic, prior.sample(noise)), prior
+        effect, step = self.effect(action, state)
+        deterministic = self.recur(state, effect)
+        prior = self.predict(deterministic, action, effect, None)
+        vantage = state.vantage if step is None else memory.moved_on(state.vantage, step)
+        return LatentState(deterministic, prior.sample(noise), vantage), prior
+
+    def effect(self, action: jax.Array, state: LatentState) -> tuple[jax.Array | None, Motion | None]:
+        """What an action does: as the recurrence reads it, and the step of the car, each where the model knows it."""
+        config = self.config
+        step = memory.intended(config, state.vantage, action) if config.tracks_motion and config.kinematics else None
+        if config.action_path == "prior":
+            return None, step
+        parts = [action / layers.per_channel(self.action_spread.value, action.ndim)]
+        if step is not None:
+            gained_mps = step.speed_mps - state.vantage.motion.speed_mps
+            moved = jnp.concatenate([step.pose, jnp.stack([gained_mps, step.speed_mps], axis=-1)], axis=-1)
+            parts.append(moved / layers.per_channel(jnp.asarray(_STEP_UNITS, jnp.float32), moved.ndim))
+        return jnp.concatenate(parts, axis=-1), step

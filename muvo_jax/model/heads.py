@@ -11,7 +11,7 @@ from collections.abc import Callable
 from flax import linen
 
 from muvo_jax.config import BIRDS_EYE_CLASSES, EGO_MOTION_UNITS, ModelConfig
-from muvo_jax.model import common, decoders, outputs, token_decoders, tokens
+from muvo_jax.model import common, decoders, memory, outputs, token_decoders, tokens
 
 
 @dataclasses.dataclass(frozen=True)
@@ -111,12 +111,13 @@ def initial_constants(config: ModelConfig) -> dict[str, float]:
     Where the average training frame is the first guess, the last layers start at zero and add nothing to it.
     """
     values: dict[str, float] = {}
+    guessed = memory.guessed_heads(config)
     for name, head in TABLE.items():
         if name not in config.heads or head.initial_bias is None:
             continue
         for scale in head.scales:
-            path = f"decoders_{name}/head_{scale}"
-            if config.first_guess == "training_mean" and name in outputs.FIRST_GUESS_HEADS:
+            path = f"decoders_{name}/{'decoder/' if name in guessed else ''}head_{scale}"
+            if config.first_guess != "zero" and name in outputs.FIRST_GUESS_HEADS:
                 values |= {f"{path}/bias": 0.0, f"{path}/kernel": 0.0}
             else:
                 values[f"{path}/bias"] = head.initial_bias

@@ -10,8 +10,9 @@ import jax
 import jax.numpy as jnp
 
 from muvo_jax.model import checks, rollout
+from muvo_jax.model import memory as memory_lib
 from muvo_jax.model.world_model import WorldModel
-from muvo_jax.types import UNTIMED_FIELDS, Array, ArrayLike, Batch, LatentState, Variables
+from muvo_jax.types import UNTIMED_FIELDS, Array, ArrayLike, Batch, LatentState, Memory, Motion, Variables
 
 
 @flax.struct.dataclass
@@ -22,11 +23,13 @@ class LiveState:
       latent: LatentState [B, ...], after the last observation; zeros before the first one.
       keys: typed keys [B]; observation t of a sample uses fold_in(key, t), as `observe` does.
       frame: int32 [B], observations since the start of the stream.
+      memory: Memory [B, ...] of the last observations, for a model with first_guess="last_seen"; `decode` takes it.
     """
 
     latent: LatentState
     keys: Array
     frame: Array
+    memory: Memory | None = None
 
 
 def start_live(model: WorldModel, key: Array, batch_size: int = 1) -> LiveState:
@@ -39,7 +42,8 @@ def start_live(model: WorldModel, key: Array, batch_size: int = 1) -> LiveState:
     """
     keys = rollout.sample_keys(key, batch_size)
     keys = jax.vmap(jax.random.fold_in, (0, None))(keys, 1)  # the keys of the latents' noise in `observe`
-    return LiveState(model.initial_state(batch_size), keys, jnp.zeros((batch_size,), jnp.int32))
+    return LiveState(model.initial_state(batch_size), keys, jnp.zeros((batch_size,), jnp.int32),
+                     memory_lib.empty(model.config, batch_size))
 
 
 def observe_step(model: WorldModel, variables: Variables, live: LiveState, observation: Mapping[str, ArrayLike],
@@ -50,7 +54,8 @@ def observe_step(model: WorldModel, variables: Variables, live: LiveState, obser
       model, variables: the model.
       live: from start_live or the call before.
       observation: field of Batch -> array [B, ...] without time axis, in the units of Batch: "image", "range_view",
-        "route_map", "speed_mps", whatever the model reads.
+        "route_map", "speed_mps", whatever the model reads. A model that moves its memory without the bicycle takes
+        "ego_motion" too where it is measured (odometry).
       previous_action: float32 [B, 2], applied between the last observation and this one; unused at the first.
       sampled: sample the latents; otherwise take their means.
 
@@ -79,4 +84,19 @@ def _observe_step(model, variables, live, batch, sampled):
         noise = rollout.mean_mode(noise)
     latent, _ = model.observe_step(variables, noise, batch.action[:, 0], live.latent, embedding[:, 0],
                                    batch.is_first[:, 0])
-    return LiveState(latent, live.keys, live.frame + 1)
+    if not model.config.tracks_motion:
+        return LiveState(latent, live.keys, live.frame + 1)
+    before = live.latent.vantage
+    step, speed_mps = _measured(model, variables, batch, before, latent)
+    still = Motion(jnp.zeros_like(before.motion.pose), speed_mps)
+    vantage = before.replace(motion=still, first=jnp.maximum(before.first - 1, 0), steps=jnp.zeros_like(before.steps))
+    remembered = None if live.memory is None else memory_lib.remember(live.memory, batch, step)
+    return LiveState(latent.replace(vantage=vantage), live.keys, live.frame + 1, remembered)
+
+
+def _measured(model, variables, batch, before, latent):
+    """The car's step since the observation before [B, 3], and its speed [B]."""
+    if model.config.kinematics is not None:
+        return memory_lib.intended(model.config, before, batch.action[:, 0]).pose, batch.speed_mps[:, 0]
+    ego_motion = model.ego_motion(variables, latent) if batch.ego_motion is None else batch.ego_motion[:, 0]
+    return ego_motion[:, :3], ego_motion[:, 3]

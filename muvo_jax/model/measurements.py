@@ -9,6 +9,7 @@ from flax import linen
 from muvo_jax.config import ModelConfig
 from muvo_jax.model import camera, common
 from muvo_jax.nn import layers, norm, resnet
+from muvo_jax.ops import conv_cpu
 
 COMMANDS = 6
 
@@ -25,6 +26,26 @@ class RouteEncoder(linen.Module):
         (deepest,) = resnet.ResNet18(self.config.backbone_width, (4,), compute, name="backbone")(image, mode)
         channels = common.measurement_channels(self.config)
         return layers.Dense(channels, compute, name="linear")(jnp.mean(deepest, axis=(1, 2)))
+
+
+class SmallRouteEncoder(linen.Module):
+    """The same by two convolutions on blocks of 4x4 pixels, whose cells stay apart: where the route turns matters."""
+
+    config: ModelConfig
+
+    @linen.compact
+    def __call__(self, route_map: jax.Array, mode: norm.Mode) -> jax.Array:
+        del mode
+        compute = common.compute(self.config)
+        x = jnp.expand_dims(route_map, -1).astype(compute.dtype) / 255.0
+        x = jax.nn.relu(layers.Dense(16, compute, name="blocks")(conv_cpu.space_to_depth(x, (4, 4))))
+        x = jax.nn.relu(layers.Conv(32, (3, 3), compute, 2, name="conv")(x))
+        return layers.Dense(common.measurement_channels(self.config), compute, name="linear")(
+            x.reshape(x.shape[0], -1))
+
+
+ROUTE_ENCODERS: dict[str, type[RouteEncoder] | type[SmallRouteEncoder]] = {
+    "resnet18": RouteEncoder, "small": SmallRouteEncoder}
 
 
 class SpeedEncoder(linen.Module):

@@ -14,8 +14,9 @@ import jax
 import jax.numpy as jnp
 
 from muvo_jax.model import checks
+from muvo_jax.model import memory as memory_lib
 from muvo_jax.model.world_model import WorldModel
-from muvo_jax.types import ArrayLike, Batch, Dream, LatentState, Observed, Predictions, StepNoise, Variables
+from muvo_jax.types import ArrayLike, Batch, Dream, LatentState, Memory, Observed, Predictions, StepNoise, Variables
 
 Policy = Callable[[jax.Array, jax.Array], jax.Array]
 _DROPOUT_SITE = 3  # the first three are those of jax.random.split(key, 3)
@@ -68,16 +69,23 @@ def mean_mode(noise: StepNoise) -> StepNoise:
 
 
 def filter_embeddings(model: WorldModel, variables: Variables, embedding: jax.Array, action: ArrayLike,
-                      is_first: ArrayLike, noise: StepNoise) -> Observed:
-    """Scans observe_step from the zero state over [B, T, ...]; action[t - 1] drives step t, zeros the first one."""
+                      is_first: ArrayLike, noise: StepNoise, speed_mps: ArrayLike | None = None) -> Observed:
+    """Scans observe_step from the zero state over [B, T, ...]; action[t - 1] drives step t, zeros the first one.
+
+    speed_mps: [B, T], for a model that tracks its motion. Vantages and memory are left to memory.of_window.
+    """
     previous = jnp.concatenate([jnp.zeros_like(action[:, :1]), action[:, :-1]], axis=1)
 
     def step(state, inputs):
-        noise_t, action_t, embedding_t, is_first_t = inputs
+        noise_t, action_t, embedding_t, is_first_t, speed_t = inputs
         state, (prior, posterior) = model.observe_step(variables, noise_t, action_t, state, embedding_t, is_first_t)
-        return state, (state.deterministic, prior, posterior)
+        deterministic = state.deterministic
+        if speed_t is not None:
+            motion = state.vantage.motion.replace(speed_mps=speed_t)
+            state = state.replace(vantage=state.vantage.replace(motion=motion))
+        return state, (deterministic, prior, posterior)
 
-    inputs = jax.tree.map(_swap_time, (noise, previous, embedding, is_first))
+    inputs = jax.tree.map(_swap_time, (noise, previous, embedding, is_first, speed_mps))
     _, outputs = jax.lax.scan(step, model.initial_state(embedding.shape[0]), inputs)
     deterministic, prior, posterior = jax.tree.map(_swap_time, outputs)
     return Observed(LatentState(deterministic, posterior.sample(noise.posterior)), posterior, prior)
@@ -104,7 +112,14 @@ def observe_window(model: WorldModel, variables: Variables, batch: Batch, keys: 
     noise = draw_noise(fold(keys, 1), batch.frames, shape, model.config.prior_dropout if train else 0.0, dropout=train)
     if not sampled:
         noise = mean_mode(noise)
-    return filter_embeddings(model, variables, embedding, batch.action, batch.is_first, noise), batch_stats
+    moved = memory_lib.measured(model.config, batch) if model.config.tracks_motion else None
+    observed = filter_embeddings(model, variables, embedding, batch.action, batch.is_first, noise,
+                                 moved and moved.speed_mps)
+    if model.config.tracks_motion:
+        moved = moved or memory_lib.from_arrivals(model.ego_motion(variables, observed.states))
+        states, remembered = memory_lib.of_window(model.config, batch, observed.states, moved)
+        observed = observed.replace(states=states, memory=remembered)
+    return observed, batch_stats
 
 
 def observe(model: WorldModel, variables: Variables, key: jax.Array, batch: Batch, *, sampled: bool = True) -> Observed:
@@ -195,10 +210,14 @@ def imagine_step(model: WorldModel, variables: Variables, key: jax.Array, state:
 
 
 def decode(model: WorldModel, variables: Variables, states: LatentState | Dream | jax.Array,
-           heads: Sequence[str] | None = None) -> Predictions:
-    """Decodes latent states (or their features) with any leading axes; see WorldModel.decode."""
-    features = states if isinstance(states, jax.Array) else states.features
-    return _decode(model, variables, features, None if heads is None else tuple(heads))
+           heads: Sequence[str] | None = None, *, memory: Memory | None = None,
+           rows: ArrayLike | None = None) -> Predictions:
+    """Decodes latent states (or their features) with any leading axes; see WorldModel.decode.
+
+    A model with first_guess="last_seen" needs the `memory` of the drives too: Observed.memory or LiveState.memory.
+    """
+    states = states.states if isinstance(states, Dream) else states
+    return _decode(model, variables, states, None if heads is None else tuple(heads), memory, rows)
 
 
 def learned_policy(model: WorldModel, variables: Variables) -> Policy:
@@ -230,8 +249,8 @@ def _observe(model, variables, keys, batch, sampled):
 
 
 @functools.partial(jax.jit, static_argnames=("model", "heads"))
-def _decode(model, variables, features, heads):
-    return model.decode(variables, features, heads)
+def _decode(model, variables, states, heads, memory, rows):
+    return model.decode(variables, states, heads, memory, rows)
 
 
 @functools.partial(jax.jit, static_argnames=("model", "sampled"))

@@ -92,6 +92,10 @@ class TokenTransition(filtering.Transition):
         if config.aligned_tokens:
             self.prior_own, self.posterior_own, self.posterior_seen = (
                 layers.Dense(config.token_channels, compute) for _ in range(3))
+        if config.action_path == "recurrence":
+            self.action_spread = self.variable("batch_stats", "action_spread", jnp.ones, (2,))
+            self.driven, self.prior_driven, self.posterior_driven = (
+                layers.Dense(config.token_channels, compute) for _ in range(3))
 
     @staticmethod
     def state_shapes(config: ModelConfig) -> tuple[tuple[int, ...], tuple[int, ...]]:
@@ -103,15 +107,21 @@ class TokenTransition(filtering.Transition):
         bias = filtering.initial_moments(config.token_channels)
         return {f"{head}/moments/bias": bias for head in ("prior", "posterior")}
 
-    def recur(self, state: LatentState) -> jax.Array:
-        return self.gru(state.deterministic, jax.nn.leaky_relu(self.pre_gru(state.stochastic), self.slope))
+    def recur(self, state: LatentState, effect: jax.Array | None) -> jax.Array:
+        x = self.pre_gru(state.stochastic)
+        if effect is not None:
+            x = x + jnp.expand_dims(self.driven(effect), -2)
+        return self.gru(state.deterministic, jax.nn.leaky_relu(x, self.slope))
 
-    def predict(self, deterministic: jax.Array, action: jax.Array, keys: jax.Array | None) -> Gaussian:
+    def predict(self, deterministic: jax.Array, action: jax.Array, effect: jax.Array | None,
+                keys: jax.Array | None) -> Gaussian:
         memory = jnp.concatenate([self._typed(deterministic, 1), self._action(self.prior_action, action)], axis=-2)
         start = self.prior_own(deterministic) if self.config.aligned_tokens else None
+        if effect is not None:
+            start = _added(start, self.prior_driven(effect), deterministic.shape)
         return self.prior(memory, keys, 0, start)
 
-    def infer(self, deterministic: jax.Array, embedding: jax.Array, action: jax.Array,
+    def infer(self, deterministic: jax.Array, embedding: jax.Array, action: jax.Array, effect: jax.Array | None,
               keys: jax.Array | None) -> Gaussian:
         remembered = deterministic if self.config.numerics == "reference" else self._typed(deterministic, 1)
         memory = jnp.concatenate([remembered, self._typed(embedding, 0), self._action(self.posterior_action, action)],
@@ -120,6 +130,8 @@ class TokenTransition(filtering.Transition):
         if self.config.aligned_tokens:
             seen = tokens.of_observation(self.posterior_seen(embedding), self.config)
             start = self.posterior_own(deterministic) + seen
+        if effect is not None:
+            start = _added(start, self.posterior_driven(effect), deterministic.shape)
         sites = attention.SITES_PER_DECODER_LAYER * self.config.transition_layers
         return self.posterior(memory, keys, sites, start)
 
@@ -130,3 +142,9 @@ class TokenTransition(filtering.Transition):
     def _action(self, embed: layers.Dense, action: jax.Array) -> jax.Array:
         embedded = jax.nn.leaky_relu(embed(action), self.slope).astype(jnp.float32)
         return self._typed(jnp.expand_dims(embedded, -2), 2)
+
+
+def _added(start: jax.Array | None, value: jax.Array, shape: tuple[int, ...]) -> jax.Array:
+    """Tokens [B, N, C] of this shape with one value [B, C] added to each; a missing start counts as zeros."""
+    value = jnp.expand_dims(value, -2)
+    return jnp.broadcast_to(value, shape) if start is None else start + value

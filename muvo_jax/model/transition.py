@@ -67,6 +67,9 @@ class VectorTransition(filtering.Transition):
         self.gru = GRUCell(config.deterministic_channels, compute)
         head = lambda: GaussianHead(config.stochastic_channels, config.action_channels, self.slope, compute)
         self.prior, self.posterior = head(), head()
+        if config.action_path == "recurrence":
+            self.action_spread = self.variable("batch_stats", "action_spread", jnp.ones, (2,))
+            self.driven = layers.Dense(config.deterministic_channels, compute)
 
     @staticmethod
     def state_shapes(config: ModelConfig) -> tuple[tuple[int, ...], tuple[int, ...]]:
@@ -77,16 +80,20 @@ class VectorTransition(filtering.Transition):
         bias = filtering.initial_moments(config.stochastic_channels)
         return {f"{head}/out/bias": bias for head in ("prior", "posterior")}
 
-    def recur(self, state: LatentState) -> jax.Array:
-        return self.gru(state.deterministic, jax.nn.leaky_relu(self.pre_gru(state.stochastic), self.slope))
+    def recur(self, state: LatentState, effect: jax.Array | None) -> jax.Array:
+        x = self.pre_gru(state.stochastic)
+        if effect is not None:
+            x = x + self.driven(effect)
+        return self.gru(state.deterministic, jax.nn.leaky_relu(x, self.slope))
 
-    def predict(self, deterministic: jax.Array, action: jax.Array, keys: jax.Array | None) -> Gaussian:
-        del keys
+    def predict(self, deterministic: jax.Array, action: jax.Array, effect: jax.Array | None,
+                keys: jax.Array | None) -> Gaussian:
+        del effect, keys  # the recurrence has it already
         return self.prior(deterministic, action)
 
-    def infer(self, deterministic: jax.Array, embedding: jax.Array, action: jax.Array,
+    def infer(self, deterministic: jax.Array, embedding: jax.Array, action: jax.Array, effect: jax.Array | None,
               keys: jax.Array | None) -> Gaussian:
-        del keys
+        del effect, keys
         return self.posterior(jnp.concatenate([deterministic, embedding], axis=-1), action)
 
 

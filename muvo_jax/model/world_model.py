@@ -19,10 +19,21 @@ import jax.numpy as jnp
 from flax import linen
 
 from muvo_jax.config import NO_SENSOR, ModelConfig
-from muvo_jax.model import camera, fusion, heads, lidar, measurements, outputs, tokens, transition
+from muvo_jax.model import (
+    camera,
+    fusion,
+    guided,
+    heads,
+    lidar,
+    measurements,
+    outputs,
+    tokens,
+    transition,
+)
+from muvo_jax.model import memory as memory_lib
 from muvo_jax.nn import init as init_lib
 from muvo_jax.nn import layers, norm
-from muvo_jax.types import BATCH_FIELDS, UNTIMED_FIELDS, Batch, Gaussian, LatentState, Predictions, StepNoise, Variables
+from muvo_jax.types import BATCH_FIELDS, UNTIMED_FIELDS, Batch, Gaussian, LatentState, Memory, Motion, Predictions, StepNoise, Variables, Vantage
 
 ROUTE_MAP_SIZE = (64, 64)
 
@@ -39,7 +50,7 @@ class Network(linen.Module):
         if config.lidar != NO_SENSOR:
             self.lidar = lidar.REGISTRY[config.lidar](config)
         if config.route:
-            self.route = measurements.RouteEncoder(config)
+            self.route = measurements.ROUTE_ENCODERS[config.route_encoder](config)
         if config.navigation:
             self.command = measurements.CommandEncoder(config)
             self.next_command = measurements.CommandEncoder(config)
@@ -48,9 +59,11 @@ class Network(linen.Module):
             self.speed = measurements.SpeedEncoder(config)
         self.fusion = fusion.REGISTRY[config.fusion](config)
         self.transition = transition.REGISTRY[config.latent](config)
-        self.decoders = {name: head.build(config, head.channels_of(config)) for name, head in heads.TABLE.items()
+        guessed = memory_lib.guessed_heads(config)
+        self.decoders = {name: guided.GuidedHead(config, name) if name in guessed
+                         else head.build(config, head.channels_of(config)) for name, head in heads.TABLE.items()
                          if name in config.heads}
-        if config.first_guess == "training_mean":
+        if config.first_guess != "zero":
             self.first_guess = {name: outputs.FirstGuess() for name in outputs.FIRST_GUESS_HEADS
                                 if name in config.heads}
 
@@ -70,13 +83,31 @@ class Network(linen.Module):
     def observe_step(self, *args):
         return self.transition.observe_step(*args)
 
-    def imagine_step(self, *args):
-        return self.transition.imagine_step(*args)
+    def imagine_step(self, noise: jax.Array, action: jax.Array, state: LatentState) -> tuple[LatentState, Gaussian]:
+        following, prior = self.transition.imagine_step(noise, action, state)
+        if self.config.tracks_motion and self.config.kinematics is None:
+            step = self.ego_motion(following.features)
+            following = following.replace(vantage=memory_lib.moved_on(state.vantage, step))
+        return following, prior
 
-    def decode(self, features: jax.Array, names: tuple[str, ...]) -> dict[str, dict[int, jax.Array]]:
-        raw = {name: self.decoders[name](self.read(features, name)) for name in names}
-        if self.config.first_guess == "training_mean":
-            raw |= {name: guess(raw[name]) for name, guess in self.first_guess.items() if name in names}
+    def ego_motion(self, features: jax.Array) -> Motion:
+        """The step that led to states, as the head says."""
+        value = self.decoders["ego_motion"](self.read(features, "ego_motion"))[1]
+        value = value * layers.per_channel(jnp.asarray(heads.TABLE["ego_motion"].unit(self.config)), value.ndim)
+        return Motion(value[..., :3], value[..., 3])
+
+    def decode(self, features: jax.Array, vantage: Vantage | None, memory: Memory | None, rows: jax.Array | None,
+               names: tuple[str, ...]) -> dict[str, dict[int, jax.Array]]:
+        glimpses = {} if memory is None else memory_lib.look(self.config, memory, rows, vantage, names)
+        raw = {}
+        for name in names:
+            read = self.read(features, name)
+            if name in glimpses:
+                raw[name] = self.decoders[name](read, glimpses[name], guided.numbers(vantage), self.first_guess[name])
+            else:
+                raw[name] = self.decoders[name](read)
+                if self.config.first_guess != "zero" and name in self.first_guess:
+                    raw[name] = self.first_guess[name](raw[name])
         return raw
 
     def read(self, features: jax.Array, head: str) -> jax.Array:
@@ -90,7 +121,8 @@ class Network(linen.Module):
                    is_first: jax.Array) -> dict[str, dict[int, jax.Array]]:
         """Touches every parameter once; only its shapes are ever computed."""
         state, _ = self.observe_step(noise, action, state, self.encode(frames, norm.Mode(), None), is_first)
-        return self.decode(state.features, self.config.heads)
+        memory = memory_lib.empty(self.config, 1)
+        return self.decode(state.features, state.vantage, memory, jnp.zeros((1,), jnp.int32), self.config.heads)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -207,12 +239,19 @@ class WorldModel:
         """
         return self._apply(variables, "imagine_step", noise, action, state)
 
-    def decode(self, variables: Variables, features: jax.Array, heads: Sequence[str] | None = None) -> Predictions:
-        """Decodes latent features [..., *feature_shape] with any leading axes.
+    def ego_motion(self, variables: Variables, states: LatentState) -> jax.Array:
+        """What the head of that name says of states [*L, ...]: [*L, 4], as Batch.ego_motion."""
+        return self.decode(variables, states.features, ("ego_motion",)).ego_motion
+
+    def decode(self, variables: Variables, states: LatentState | jax.Array, heads: Sequence[str] | None = None,
+               memory: Memory | None = None, rows: jax.Array | None = None) -> Predictions:
+        """Decodes latent states with any leading axes.
 
         Args:
           variables: of this model.
-          features: LatentState.features.
+          states: LatentState [...], or, where no head looks at a memory, LatentState.features [..., *feature_shape].
+          memory: Memory of B drives, for a model with first_guess="last_seen" (Observed.memory, LiveState.memory).
+          rows: int32 [...], the drive that each state belongs to; by default the first axis of the states counts them.
           heads: which ones; None for all that the model has. Only these are computed.
 
         Returns:
@@ -221,19 +260,26 @@ class WorldModel:
           heads return, model/heads.py says.
 
         Raises:
-          ValueError: for a head that the model does not have, or features of another shape.
+          ValueError: for a head that the model does not have, features of another shape, or states without the memory
+            that their heads need.
         """
         names = self.config.heads if heads is None else tuple(heads)
         unknown = [name for name in names if name not in self.config.heads]
         if unknown:
             raise ValueError(f"decode: this model has no head {', '.join(unknown)}; "
                              f"it has {', '.join(self.config.heads)}.")
+        features = states.features if isinstance(states, LatentState) else states
         shape = self.feature_shape
         lead = features.shape[:-len(shape)]
         if features.shape[len(lead):] != shape:
             raise ValueError(f"decode: got features {list(features.shape)}, expected "
                              f"[{', '.join(map(str, ('...', *shape)))}] for the {self.config.latent} latent.")
-        flat = self._apply(variables, "decode", features.reshape(-1, *shape), names)
+        vantage = None
+        if set(memory_lib.guessed_heads(self.config)).isdisjoint(names):
+            memory = None
+        else:
+            vantage, rows = memory_lib.check(self.config, states, memory, rows, lead)
+        flat = self._apply(variables, "decode", features.reshape(-1, *shape), vantage, memory, rows, names)
         return Predictions({name: {scale: _finished(value, name, scale, self.config).reshape(*lead, *value.shape[1:])
                                    for scale, value in scales.items()} for name, scales in flat.items()})
 
@@ -270,9 +316,9 @@ def inputs(config: ModelConfig) -> dict[str, tuple[int, ...]]:
         fields["route_map"] = ROUTE_MAP_SIZE
     if config.navigation:
         fields |= {"command": (), "next_command": (), "target_m": (2,), "next_target_m": (2,)}
-    if config.speed:
+    if config.speed or (config.tracks_motion and config.kinematics is not None):
         fields["speed_mps"] = ()
-    return fields
+    return fields | memory_lib.inputs(config)
 
 
 def _finished(value: jax.Array, name: str, scale: int, config: ModelConfig) -> jax.Array:

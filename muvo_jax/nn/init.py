@@ -10,7 +10,7 @@
 | GRU kernels and biases | uniform within 1 / sqrt(hidden channels) |
 | scale of the norm that ends a residual branch (bn2), of another norm; its bias | 0, 1; 0 |
 | constant and query_*; type_embedding | standard normal; 0 |
-| running mean; running variance | 0; 1 |
+| running mean; running variance, spread of actions | 0; 1 |
 
 Torch's defaults (uniform within 1 / sqrt(fan_in)) shrink the signal in every dense layer and several times in every
 transposed one, and start adaptive norms at a scale near 0: what a latent says then drowns in its noise, and decoders
@@ -64,7 +64,7 @@ def _uniform(random: np.random.Generator, shape: tuple[int, ...], bound: float) 
 def _leaf(path: tuple[str, ...], siblings: Mapping[str, tuple[int, ...]], random: np.random.Generator) -> np.ndarray:
     leaf, shape = path[-1], siblings[path[-1]]
     if path[0] == "batch_stats":
-        return np.full(shape, 1.0 if leaf == "var" else 0.0, np.float32)
+        return np.full(shape, 1.0 if leaf in ("var", "action_spread") else 0.0, np.float32)
     if leaf == "constant" or leaf.startswith("query_"):
         return random.standard_normal(shape, np.float32)
     if leaf == "scale":

@@ -1,7 +1,7 @@
 """Targets at the decoders' scales (paper section III-D): full size, half and quarter.
 
-Images are averaged over 2x2 pixels. Range views and occupancy are subsampled (index 2i), because the mean of a return
-and of a hole, or of a class and "unknown", means nothing. Each scale comes from the one before, as in the reference.
+Images are averaged over 2x2 pixels. Range views are subsampled (index 2i), because the mean of a return and of a hole
+means nothing. Occupancy is pooled: what a coarse voxel covers is occupied if any of it is. Each scale comes from the one before, as in the reference.
 """
 
 from __future__ import annotations
@@ -27,9 +27,16 @@ def range_view_labels(range_view: types.ArrayLike) -> dict[int, types.Array]:
     return {scale: jnp.asarray(range_view)[..., ::scale, ::scale, :] for scale in SCALES}
 
 
-def occupancy_labels(occupancy: types.ArrayLike) -> dict[int, types.Array]:
-    """uint8 [..., X, Y, Z] to {scale: uint8 [..., X/scale, Y/scale, Z/scale]}, unknown stays 255."""
-    return {scale: jnp.asarray(occupancy)[..., ::scale, ::scale, ::scale] for scale in SCALES}
+def occupancy_labels(occupancy: types.ArrayLike, *, pooled: bool = True) -> dict[int, types.Array]:
+    """uint8 [..., X, Y, Z] to {scale: uint8 [..., X/scale, Y/scale, Z/scale]}.
+
+    A coarse voxel is occupied if any of its voxels is, and unknown (255) only if all are. Unless `pooled` it is its
+    first voxel alone, as in the reference: at scale 4 of the paper's grid an obstacle at 0 to 2 m is then the road.
+    """
+    labels = {1: jnp.asarray(occupancy)}
+    for scale in SCALES[1:]:
+        labels[scale] = resample.pool_occupancy(labels[scale // 2]) if pooled else labels[1][..., ::scale, ::scale, ::scale]
+    return labels
 
 
 def map_labels(array: types.ArrayLike) -> dict[int, types.Array]:

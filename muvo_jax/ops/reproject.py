@@ -150,15 +150,15 @@ def onto_beams(range_view: Array, geometry: RangeViewGeometry) -> Array:
     return jnp.where(range_view[..., 3:] > 0.0, moved, range_view)
 
 
-def fill_holes(range_view: Array, sky: Array, geometry: RangeViewGeometry, rounds: int = 2) -> Array:
+def fill_holes(range_m: Array, sky: Array, geometry: RangeViewGeometry, rounds: int = 2) -> Array:
     """Ranges [N, Hr, Wr] in which pixels that neither returned nor are `sky` take the mean of their neighbours.
 
     Of inverse horizontal distances, so that a neighbouring sky counts as 0 and not as infinity. For looking things up,
     not a measurement. Pixels that stay unknown, and sky, hold -1.
     """
     flat = jnp.sqrt(1.0 - jnp.asarray(range_view_ops.beam_directions(geometry))[None, ..., 2] ** 2)
-    returned = range_view[..., 3] > 0.0
-    nearness = jnp.where(returned, 1.0 / jnp.where(returned, range_view[..., 3] * flat, 1.0), 0.0)
+    returned = range_m > 0.0
+    nearness = jnp.where(returned, 1.0 / jnp.where(returned, range_m * flat, 1.0), 0.0)
     known = returned | sky
     for _ in range(rounds):
         total, count = _neighbours(jnp.where(known, nearness, 0.0)), _neighbours(known.astype(jnp.float32))

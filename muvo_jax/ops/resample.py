@@ -1,4 +1,4 @@
-"""Changing the resolution of channels-last grids: linear up-sampling and the mean of 2x2 pixels.
+"""Changing the resolution of grids: linear up-sampling, the mean of 2x2 pixels, pooled voxels.
 
 Linear sampling is that of torch with align_corners=False and no antialiasing: output pixel i reads input position
 (i + 1/2) * (input size / output size) - 1/2, clamped to the grid.
@@ -11,6 +11,8 @@ import functools
 import jax
 import jax.numpy as jnp
 from jax import lax
+
+from muvo_jax.types import OCCUPANCY_OCCUPIED, OCCUPANCY_UNKNOWN
 
 
 def upsample_linear(x, factor: int = 2):
@@ -59,6 +61,27 @@ def _upsample_axis(x, factor: int, axis: int):
         phases.append(x if offset == 0 else (1 - abs(offset)) * x + abs(offset) * neighbour)
     shape = (*x.shape[:axis], size * factor, *x.shape[axis + 1:])
     return jnp.stack(phases, axis + 1).reshape(shape)
+
+
+def max_pool2(x):
+    """Largest of 2x2x2 voxels, [N, X, Y, Z] -> [N, X/2, Y/2, Z/2]; all sides even."""
+    count, *sides = x.shape
+    halves = [part for side in sides for part in (side // 2, 2)]
+    return x.reshape(count, *halves).max(axis=(2, 4, 6))
+
+
+def pool_occupancy(occupancy):
+    """Occupancy [..., X, Y, Z] (0, 1, 255 unknown) at half the size, NumPy or JAX, in its dtype; all sides even.
+
+    A coarse voxel is occupied if any of its eight is, and unknown only if all are.
+    """
+    *lead, x, y, z = occupancy.shape
+    blocks = occupancy.reshape(*lead, x // 2, 2, y // 2, 2, z // 2, 2)
+    within = (-5, -3, -1)
+    occupied = (blocks == OCCUPANCY_OCCUPIED).any(axis=within)
+    unknown = (blocks == OCCUPANCY_UNKNOWN).all(axis=within)
+    dtype = occupancy.dtype
+    return occupied.astype(dtype) * OCCUPANCY_OCCUPIED + (unknown & ~occupied).astype(dtype) * OCCUPANCY_UNKNOWN
 
 
 def mean_pool2(x):

@@ -14,6 +14,7 @@ from muvo_jax.objectives import labels
 from muvo_jax.training import parallel as parallel_lib
 from muvo_jax.training import state as state_lib
 
+_LEAST_SPREAD = 0.02  # of an action that hardly ever moves: its noise is not to be made large
 _PRIOR_FRAMES = 4.0  # frames of evidence, a quarter of them occupied, that a voxel starts with
 
 
@@ -37,15 +38,25 @@ def constants(mean: baselines.TrainingMean, config: config_lib.ModelConfig) -> d
             view[..., :3] = 0.0
         full["range_view"] = labels.range_view_labels(view)
     if "occupancy" in config.heads and mean.occupied is not None and mean.known is not None:
-        share = (mean.occupied + 0.25 * _PRIOR_FRAMES) / (mean.known + _PRIOR_FRAMES)
-        logits = np.stack([np.zeros(share.shape), np.log(share) - np.log1p(-share)], axis=-1).astype(np.float32)
-        full["occupancy"] = {scale: logits[::scale, ::scale, ::scale] for scale in labels.SCALES}
+        full["occupancy"] = {scale: _log_odds(mean.occupied[scale], mean.known[scale]) for scale in labels.SCALES}
     return {outputs.first_guess_path(head): {f"scale_{scale}": np.asarray(value, np.float32)
                                              for scale, value in scales.items()} for head, scales in full.items()}
+
+
+def _log_odds(occupied: np.ndarray, known: np.ndarray) -> np.ndarray:
+    """Logits [..., 2] of voxels that are occupied in so many frames of those that know them."""
+    share = (occupied + 0.25 * _PRIOR_FRAMES) / (known + _PRIOR_FRAMES)
+    return np.stack([np.zeros(share.shape), np.log(share) - np.log1p(-share)], axis=-1).astype(np.float32)
 
 
 def fill(state: state_lib.TrainState, mean: baselines.TrainingMean, config: config_lib.ModelConfig,
          plan: parallel_lib.Plan) -> state_lib.TrainState:
     """`state` with the constants of `mean`, placed as `plan` says."""
-    batch_stats = {**state.batch_stats, **constants(mean, config)}
+    batch_stats = {**state.batch_stats}
+    if config.first_guess != "zero":
+        batch_stats |= constants(mean, config)
+    if config.action_path == "recurrence" and mean.action is not None:
+        spread = np.sqrt(mean.action / mean.frames)
+        batch_stats["transition"] = {**batch_stats.get("transition", {}),
+                                     "action_spread": np.maximum(spread, _LEAST_SPREAD).astype(np.float32)}
     return parallel_lib.place_state(plan, dataclasses.replace(state, batch_stats=batch_stats))

@@ -27,7 +27,7 @@ from muvo_jax.training import parallel as parallel_lib
 from muvo_jax.training import state as state_lib
 
 Metrics = dict[str, types.Array]
-_DECODE_SITE, _IMAGINE_SITE = 0xDEC0, 0x1A61  # separate these draws from all others made with the same sample key
+_DECODE_SITE, _IMAGINE_SITE, _RESTART_SITE = 0xDEC0, 0x1A61, 0x2E57  # separate these draws from all others made with the same sample key
 _VALIDATION_STEP = 2**31 - 1  # folded into the key where training folds its step in; no run gets there
 
 
@@ -191,15 +191,19 @@ def forward(params: Any, batch_stats: Any, batch: types.Batch, keys: types.Array
     shown = batch.time_slice(0, seen)
     if train:
         shown = augmentation.augment(shown, keys, config.augmentation)
+        if config.train.restart:
+            shown = shown.replace(is_first=_restarted(shown.is_first, keys))
     observed, batch_stats = maybe_remat(observe)(variables, shown, keys)
-    features = observed.states.features
+    states, memory = observed.states, observed.memory
+    if memory is not None and memory.image is not None:  # as recorded: a moved picture is compared with the recorded one
+        memory = memory.replace(image=jnp.asarray(batch.image)[:, :seen])
     if train:
-        features = _and_imagined(model, variables, observed, batch.action, keys)
-        features, batch = _some_frames(features, batch, keys, config.train.decode_frames)
+        states = _and_imagined(model, variables, observed, batch.action, keys)
+        states, batch = _some_frames(states, batch, keys, config.train.decode_frames)
     predictions = types.Predictions({})
     for head in model.config.heads:
         decode = functools.partial(model.decode, heads=(head,))
-        predictions |= maybe_remat(decode)(variables, features)
+        predictions |= maybe_remat(decode)(variables, states, memory=memory)
     terms = total.losses(predictions, batch, observed, model=model.config, loss=config.loss, keys=keys,
                          axis_name=axis_name, frozen=frozen)
     metrics = dict(terms)
@@ -209,31 +213,41 @@ def forward(params: Any, batch_stats: Any, batch: types.Batch, keys: types.Array
 
 
 def _and_imagined(model: world_model.WorldModel, variables: types.Variables, observed: types.Observed,
-                  action: types.ArrayLike, keys: types.Array) -> types.Array:
-    """Features of all frames of a window: the observed ones, then those that follow from the last one's state.
+                  action: types.ArrayLike, keys: types.Array) -> types.LatentState:
+    """States of all frames of a window: the observed ones, then those that follow from the last one's state.
 
     The loss of a decoded frame then also teaches prediction over several steps, beside the KL divergence over one.
     """
     seen = observed.states.deterministic.shape[1]
     if seen == action.shape[1]:
-        return observed.states.features
+        return observed.states
     dream_keys = jax.vmap(jax.random.fold_in, (0, None))(keys, _IMAGINE_SITE)
     dream = rollout.imagine(model, variables, dream_keys, observed.last, action[:, seen - 1:-1])
-    return jnp.concatenate([observed.states.features, dream.features], axis=1)
+    return jax.tree.map(lambda *parts: jnp.concatenate(parts, axis=1), observed.states, dream.states)
 
 
-def _some_frames(features: types.Array, batch: types.Batch, keys: types.Array,
-                 count: int) -> tuple[types.Array, types.Batch]:
+def _restarted(is_first: types.ArrayLike, keys: types.Array) -> types.Array:
+    """bool [B, T]: each window is cut in two at a frame drawn anew (or not at all, at the first).
+
+    So the last observed state has seen 1 to T frames, and a dream starts from any of these.
+    """
+    frames = is_first.shape[1]
+    at = jax.vmap(lambda key: jax.random.randint(jax.random.fold_in(key, _RESTART_SITE), (), 0, frames))(keys)
+    return jnp.asarray(is_first) | (jnp.arange(frames)[None] == at[:, None])
+
+
+def _some_frames(states: types.LatentState, batch: types.Batch, keys: types.Array,
+                 count: int) -> tuple[types.LatentState, types.Batch]:
     """Of each window the `count` frames that are decoded, drawn anew in every step; 0 or T and more take all of them.
 
     Neighbouring frames look alike: decoding a few of more windows teaches more at the same cost.
     """
     if count == 0 or count >= batch.frames:
-        return features, batch
+        return states, batch
     draw = lambda key: jax.random.permutation(jax.random.fold_in(key, _DECODE_SITE), batch.frames)[:count]
     chosen = jax.vmap(draw)(keys)
     pick = jax.vmap(lambda leaf, index: leaf[index])
-    return pick(features, chosen), batch.map_frames(lambda leaf: pick(leaf, chosen))
+    return jax.tree.map(lambda leaf: pick(leaf, chosen), states), batch.map_frames(lambda leaf: pick(leaf, chosen))
 
 
 def _mean(values: types.Array, axis_name: str | None) -> types.Array:

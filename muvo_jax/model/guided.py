@@ -1,0 +1,180 @@
+"""Decoders that see the memory: a U-net whose deepest map is the latent's (model.first_guess="last_seen").
+
+On the way down it reads the memory as it looks from the state's vantage, on the way up it draws what must be added to
+that, where it covers anything, and to the average training frame elsewhere. So a fresh model predicts the moved memory
+and learns the rest: to fill what was hidden, to move what moves, to blur what is uncertain.
+"""
+
+from __future__ import annotations
+
+import math
+
+import jax
+import jax.numpy as jnp
+from flax import linen
+
+from muvo_jax.config import ModelConfig
+from muvo_jax.model import common, memory, outputs, tokens
+from muvo_jax.nn import layers
+from muvo_jax.ops import conv_cpu, resample
+from muvo_jax.types import RANGE_NO_RETURN_M, Vantage
+
+SCALES = (4, 2, 1)
+_SHRINK = {"image": tokens.IMAGE_SHRINK, "range_view": tokens.RANGE_VIEW_SHRINK}
+_WIDTHS = {8: 1, 4: 1, 2: 2, 1: 4}  # what the width is divided by at each scale
+_TRUST = 3.0  # log-odds that evidence of a hit or of a look through is worth to a fresh model
+_NEAR_M = 10.0  # ranges are seen as 10 m / (10 m + range) too: near ones matter
+_OVER_ROAD_M = 0.5  # a fresh model believes evidence above this height; the road's rings do not move with the world
+
+
+def _activation(x: jax.Array) -> jax.Array:
+    return jax.nn.leaky_relu(x, 0.1)
+
+
+class GuidedDecoder(linen.Module):
+    """Features and what is seen [N, *plane, C] -> {scale: [N, *plane / scale, outputs]}, raw.
+
+    Attributes:
+      config: of the model.
+      head: image, range_view or occupancy.
+      plane: full size; the ground plan of the voxels, whose heights are channels.
+      outputs: scale -> channels.
+    """
+
+    config: ModelConfig
+    head: str
+    plane: tuple[int, int]
+    outputs: tuple[tuple[int, int], ...]
+
+    @linen.compact
+    def __call__(self, features: jax.Array, seen: jax.Array, numbers: jax.Array) -> dict[int, jax.Array]:
+        config, compute = self.config, common.compute(self.config)
+        width = config.guided_channels[("image", "range_view", "occupancy").index(self.head)]
+        dense = lambda name, x, features: layers.Dense(features, compute, name=name)(x)
+        conv = lambda name, x, features: _activation(layers.Conv(features, (3, 3), compute, name=name)(x))
+        # Doubling and halving by dense layers on 2x2 pixels: whole matrix products, on any backend.
+        grow = lambda name, x, features: _activation(conv_cpu.depth_to_space(dense(name, x, 4 * features), (2, 2)))
+        down = {1: seen.astype(compute.dtype)}
+        for scale in (2, 4, 8):
+            down[scale] = conv(f"see_{scale}", conv_cpu.space_to_depth(down[scale // 2], (2, 2)), width // _WIDTHS[scale])
+        x = self._latent(features, width)
+        while x.shape[1] < self.plane[0] // 8:
+            x = grow(f"pre_{x.shape[1]}", x, width)
+        x = conv("join", x + down[8] + layers.spread(dense("numbers", numbers, width), 4), width)
+        out = {}
+        for scale in SCALES:
+            x = grow(f"grow_{scale}", x, width // _WIDTHS[scale])
+            x = conv(f"draw_{scale}", jnp.concatenate([x, down[scale]], axis=-1), width // _WIDTHS[scale])
+            out[scale] = dense(f"head_{scale}", x, dict(self.outputs)[scale]).astype(jnp.float32)
+        return out
+
+    def _latent(self, features: jax.Array, width: int) -> jax.Array:
+        """The latent as a map of the plane: the head's tokens, or a vector unfolded."""
+        config, compute = self.config, common.compute(self.config)
+        if features.ndim == 2:
+            shrink = _SHRINK.get(self.head, 8)
+            size = tuple(math.ceil(side / shrink) for side in self.plane)
+            seed = layers.Dense(width, compute, name="linear")(features)
+            return _activation(layers.Unfold(width, size, compute, name="seed")(seed))
+        if features.ndim == 5:  # heights become channels
+            features = features.reshape(*features.shape[:3], -1)
+        return _activation(layers.Conv(width, (3, 3), compute, name="first")(features))
+
+
+class GuidedHead(linen.Module):
+    """One head of a model with memory: (features, Glimpse, numbers, average frame) -> {scale: raw prediction}, as heads.TABLE has it."""
+
+    config: ModelConfig
+    head: str
+
+    @linen.compact
+    def __call__(self, features: jax.Array, glimpse: memory.Glimpse, numbers: jax.Array,
+                 mean: outputs.FirstGuess) -> dict[int, jax.Array]:
+        config = self.config
+        plane = {"image": config.image_size, "range_view": (config.range_view.rows, config.range_view.columns),
+                 "occupancy": config.voxels.shape[:2]}[self.head]
+        outputs_of = {"image": lambda scale: 3, "range_view": lambda scale: 5,
+                      "occupancy": lambda scale: 2 * config.voxels.shape[2] // scale}[self.head]
+        decoder = GuidedDecoder(config, self.head, plane, tuple((scale, outputs_of(scale)) for scale in SCALES),
+                                name="decoder")
+        see, compose = _PARTS[self.head]
+        raw = decoder(features, see(glimpse, config), numbers)
+        return compose(raw, glimpse, mean, config)
+
+
+def numbers(vantage: Vantage) -> jax.Array:
+    """[n, 5]: how long ago and how far away the newest observation is, about 1 where that is much."""
+    pose = vantage.motion.pose
+    scaled = pose / jnp.array([10.0, 2.0, 0.3], jnp.float32).reshape(1, 3)
+    steps = vantage.steps.astype(jnp.float32)[:, None] / 5.0
+    return jnp.concatenate([scaled, steps, vantage.motion.speed_mps[:, None] / 10.0], axis=-1)
+
+
+def _see_image(glimpse: memory.Glimpse, config: ModelConfig) -> jax.Array:
+    del config
+    return jnp.concatenate([glimpse.image - 0.5 * glimpse.covered, glimpse.covered], axis=-1)
+
+
+def _compose_image(raw, glimpse: memory.Glimpse, mean, config: ModelConfig) -> dict[int, jax.Array]:
+    del config
+    drawn, average = raw, mean(jax.tree.map(jnp.zeros_like, raw))
+    moved, covered, result = glimpse.image, glimpse.covered, {}
+    for scale in (1, 2, 4):
+        if scale > 1:
+            moved, covered = resample.mean_pool2(moved), resample.mean_pool2(covered)
+        result[scale] = moved + (1.0 - covered) * average[scale] + drawn[scale]
+    return result
+
+
+def _nearness(range_m: jax.Array) -> jax.Array:
+    return jnp.where(range_m > 0.0, _NEAR_M / (_NEAR_M + jnp.maximum(range_m, 0.0)), 0.0)
+
+
+def _see_ranges(glimpse: memory.Glimpse, config: ModelConfig) -> jax.Array:
+    scale_m = config.range_scale_m
+    given = [glimpse.filled_m, glimpse.newest_m, glimpse.still_m]
+    channels = [*map(_nearness, given), *(jnp.maximum(value, 0.0) / scale_m for value in (given[0], given[2])),
+                *((value > 0.0).astype(jnp.float32) for value in (glimpse.moved_m, *given)), glimpse.sky,
+                glimpse.height_m / 5.0]
+    return jnp.stack(channels, axis=-1)
+
+
+def _compose_ranges(raw, glimpse: memory.Glimpse, mean, config: ModelConfig) -> dict[int, jax.Array]:
+    """x, y, z and range in units of range_scale_m; the range is -1 m where nothing is expected to return."""
+    average = mean({scale: jnp.zeros_like(value[..., :4]) for scale, value in raw.items()})
+    nothing, result = RANGE_NO_RETURN_M / config.range_scale_m, {}
+    for scale, value in raw.items():
+        moved, filled, sky = (array[:, ::scale, ::scale] for array in (glimpse.moved_m, glimpse.filled_m, glimpse.sky))
+        usual = average[scale][..., 3]
+        range_ = jnp.where(filled > 0.0, filled / config.range_scale_m, jnp.maximum(usual, 0.0)) + value[..., 3]
+        prior = jnp.where(moved > 0.0, 2.0, jnp.where(filled > 0.0, 1.0, jnp.where(usual > 0.0, 0.5, -1.0)))
+        logit = value[..., 4] + jnp.where(sky > 0.0, -2.0, prior)
+        soft = jax.nn.sigmoid(logit)
+        # Decided, because half a range is no range; the gradient is that of the probability.
+        returned = jax.lax.stop_gradient((logit > 0.0).astype(jnp.float32) - soft) + soft
+        range_ = nothing + returned * (range_ - nothing)
+        result[scale] = jnp.concatenate([value[..., :3] + average[scale][..., :3], jnp.expand_dims(range_, -1)], axis=-1)
+    return result
+
+
+def _see_voxels(glimpse: memory.Glimpse, config: ModelConfig) -> jax.Array:
+    del config
+    return jnp.concatenate([glimpse.newest, glimpse.older], axis=-1)
+
+
+def _compose_voxels(raw, glimpse: memory.Glimpse, mean, config: ModelConfig) -> dict[int, jax.Array]:
+    grid = config.voxels
+    heights = grid.origin_m[2] + grid.voxel_size_m * jnp.arange(grid.shape[2])
+    trust = jnp.where(heights >= _OVER_ROAD_M - 1e-3, _TRUST, 0.0).reshape(1, 1, 1, -1)
+    believed = trust * jnp.clip(glimpse.newest + glimpse.older, -1.0, 1.0)
+    raw = {scale: value.reshape(*value.shape[:3], -1, 2) for scale, value in raw.items()}
+    own, result = mean(raw), {}
+    for scale in (1, 2, 4):
+        if scale > 1:
+            believed = resample.max_pool2(believed)
+        result[scale] = own[scale] + jnp.stack([jnp.zeros_like(believed), believed], axis=-1)
+    return result
+
+
+_PARTS = {"image": (_see_image, _compose_image), "range_view": (_see_ranges, _compose_ranges),
+          "occupancy": (_see_voxels, _compose_voxels)}

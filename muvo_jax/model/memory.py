@@ -1,0 +1,262 @@
+"""What was seen of late and how it looks from where a state is: the geometric memory (first_guess="last_seen").
+
+Moving what the sensors showed by the motion of the car needs no learning, and says most of what the next frames show.
+So a model with this memory keeps its last observations as they came (types.Memory, beside the states, once for all
+that is imagined from them), its states know where they stand to it (types.Vantage), and its decoders see the memory as
+it looks from there: `look`. What a state's own observation showed is hidden from its decoders: copying it would teach
+nothing. docs/memory.md says what this brings and what it cannot do.
+"""
+
+from __future__ import annotations
+
+import flax.struct
+import jax
+import jax.numpy as jnp
+
+from muvo_jax.config import NO_SENSOR, ModelConfig
+from muvo_jax.ops import motion as motion_ops
+from muvo_jax.ops import reproject
+from muvo_jax.types import Array, Batch, LatentState, Memory, Motion, Vantage
+
+FADE = 0.8  # weight of evidence that is one observation older: what moved away is forgotten
+
+
+@flax.struct.dataclass
+class Glimpse:
+    """The memory of one head from n vantages, at full size.
+
+    Attributes:
+      image: float32 [n, H, W, 3] in [0, 1], the newest image moved, and `covered` [n, H, W, 1], 1 where it was seen.
+      moved_m, newest_m, still_m: float32 [n, Hr, Wr] ranges, -1 where nothing is: all scans moved, the newest moved, and
+        the newest as it was (the rings on the ground do not move).
+      filled_m: float32 [n, Hr, Wr], moved_m with its small holes filled.
+      sky: float32 [n, Hr, Wr], 1 where a pixel without a return came to lie.
+      height_m: float32 [n, Hr, Wr], of the moved returns over the road.
+      newest, older: float32 [n, X, Y, Z] in [-1, 1], evidence of the newest scan and of all before it.
+    """
+
+    image: Array | None = None
+    covered: Array | None = None
+    moved_m: Array | None = None
+    newest_m: Array | None = None
+    still_m: Array | None = None
+    filled_m: Array | None = None
+    sky: Array | None = None
+    height_m: Array | None = None
+    newest: Array | None = None
+    older: Array | None = None
+
+
+def guessed_heads(config: ModelConfig) -> tuple[str, ...]:
+    """The heads whose decoders see the memory: what cannot be moved (nothing moves without ranges) is not guessed."""
+    if config.first_guess != "last_seen" or config.lidar == NO_SENSOR:
+        return ()
+    seen = ("image",) if config.camera != NO_SENSOR else ()
+    return tuple(head for head in (*seen, "range_view", "occupancy") if head in config.heads)
+
+
+def inputs(config: ModelConfig) -> dict[str, tuple[int, ...]]:
+    """What is remembered of an observation: field of Batch -> its shape for one frame."""
+    heads = guessed_heads(config)
+    fields: dict[str, tuple[int, ...]] = {}
+    if heads:
+        fields["range_view"] = (config.range_view.rows, config.range_view.columns, 4)
+    if "image" in heads:
+        fields |= {"image": (*config.image_size, 3), "intrinsics": (3, 3), "camera_to_ego": (4, 4)}
+    return fields
+
+
+def initial_vantage(config: ModelConfig, batch_size: int) -> Vantage:
+    """Before anything was seen: no observation is remembered."""
+    zeros = jnp.zeros((batch_size,), jnp.int32)
+    return Vantage(Motion(jnp.zeros((batch_size, 3)), jnp.zeros((batch_size,))), zeros + config.memory_frames,
+                   zeros + config.memory_frames - 1, zeros)
+
+
+def intended(config: ModelConfig, vantage: Vantage, action: Array) -> Motion:
+    """What an action [..., 2] does to the car in one step of the model, in the ego frame before it."""
+    kinematics = config.kinematics
+    standing = motion_ops.at_rest_of_frame(vantage.motion.speed_mps)
+    return motion_ops.drive(standing, action, kinematics.contract, kinematics.periods)
+
+
+def moved_on(vantage: Vantage, step: Motion) -> Vantage:
+    """After one imagined step, given in the ego frame before it."""
+    motion = motion_ops.moved(vantage.motion, jnp.concatenate([step.pose, jnp.expand_dims(step.speed_mps, -1)], -1))
+    return vantage.replace(motion=motion, steps=vantage.steps + 1)
+
+
+def measured(config: ModelConfig, batch: Batch) -> Motion | None:
+    """The speed [B, T] and what the car does from each frame to the next, as far as it was measured.
+
+    It is what the contract's bicycle makes of measured speeds and actions; without kinematics what the recording says
+    (Batch.ego_motion), and None where it does not say: then the head ego_motion must.
+    """
+    if config.kinematics is not None:
+        standing = motion_ops.at_rest_of_frame(jnp.asarray(batch.speed_mps))
+        kinematics = config.kinematics
+        steps = motion_ops.drive(standing, jnp.asarray(batch.action), kinematics.contract, kinematics.periods)
+        return Motion(steps.pose, standing.speed_mps)
+    return None if batch.ego_motion is None else from_arrivals(jnp.asarray(batch.ego_motion))
+
+
+def from_arrivals(ego_motion: Array) -> Motion:
+    """Batch.ego_motion [B, T, 4], which says how the car came to each frame, as the motion from each frame on."""
+    onward = jnp.concatenate([ego_motion[:, 1:, :3], jnp.zeros_like(ego_motion[:, :1, :3])], axis=1)
+    return Motion(onward, ego_motion[..., 3])
+
+
+def of_window(config: ModelConfig, batch: Batch, states: LatentState,
+              measured: Motion) -> tuple[LatentState, Memory | None]:
+    """The states [B, T] of an observed window with their vantages, and the memory that they look at."""
+    is_first, frames = jnp.asarray(batch.is_first), batch.frames
+    steps, speed_mps = measured.pose, measured.speed_mps
+
+    def walk(pose, step):
+        following = motion_ops.moved(Motion(pose, pose[..., 0]), jnp.concatenate([step, step[..., :1]], -1)).pose
+        return following, pose
+
+    _, poses = jax.lax.scan(walk, jnp.zeros_like(steps[:, 0]), jnp.swapaxes(steps, 0, 1))
+    poses = jnp.swapaxes(poses, 0, 1)
+    poses = motion_ops.relative(poses, jnp.broadcast_to(poses[:, -1:], poses.shape))
+    index = jnp.broadcast_to(jnp.arange(frames, dtype=jnp.int32)[None], is_first.shape)
+    first = jax.lax.cummax(jnp.where(is_first, index, 0), axis=1)
+    states = states.replace(vantage=Vantage(Motion(poses, speed_mps), first, index, jnp.zeros_like(index)))
+    return states, _remembered(config, batch, poses)
+
+
+def _remembered(config: ModelConfig, batch: Batch, poses: Array) -> Memory | None:
+    heads = guessed_heads(config)
+    if not heads:
+        return None
+    with_image = "image" in heads
+    pick = lambda name: jnp.asarray(getattr(batch, name)) if with_image else None
+    return Memory(poses, jnp.asarray(batch.range_view), pick("image"), pick("intrinsics"), pick("camera_to_ego"))
+
+
+def empty(config: ModelConfig, batch_size: int) -> Memory | None:
+    """The memory of a stream before its first observation, of config.memory_frames places."""
+    heads = guessed_heads(config)
+    if not heads:
+        return None
+    lead, view = (batch_size, config.memory_frames), config.range_view
+    memory = Memory(jnp.zeros((*lead, 3)), jnp.full((*lead, view.rows, view.columns, 4), -1.0))
+    if "image" not in heads:
+        return memory
+    return memory.replace(image=jnp.zeros((*lead, *config.image_size, 3), jnp.uint8),
+                          intrinsics=jnp.zeros((batch_size, 3, 3)), camera_to_ego=jnp.zeros((batch_size, 4, 4)))
+
+
+def remember(memory: Memory, batch: Batch, step: Array) -> Memory:
+    """With one more observation (a batch of one frame), the oldest one forgotten.
+
+    step: float32 [B, 3], where the car stands in the ego frame of the observation before.
+    """
+    append = lambda old, new: jnp.concatenate([old[:, 1:], jnp.asarray(new).astype(old.dtype)], axis=1)
+    poses = motion_ops.relative(memory.pose, jnp.broadcast_to(step[:, None], memory.pose.shape))
+    memory = memory.replace(pose=append(poses, jnp.zeros_like(step)[:, None]),
+                            range_view=append(memory.range_view, batch.range_view))
+    if memory.image is None:
+        return memory
+    return memory.replace(image=append(memory.image, batch.image), intrinsics=jnp.asarray(batch.intrinsics),
+                          camera_to_ego=jnp.asarray(batch.camera_to_ego))
+
+
+def check(config: ModelConfig, states: LatentState | Array, memory: Memory | None, rows: Array | None,
+          lead: tuple[int, ...]) -> tuple[Vantage, Array]:
+    """The flat vantage and rows of states [*lead, ...] that are decoded with a memory.
+
+    Raises:
+      ValueError: if there is no vantage or no memory, the memory is of other sizes, or the states' first axis does not
+        count its drives.
+    """
+    heads = ", ".join(guessed_heads(config))
+    if not isinstance(states, LatentState) or states.vantage is None or memory is None:
+        came = "features" if not isinstance(states, LatentState) else (
+            "states without a vantage" if states.vantage is None else "states")
+        raise ValueError(f"decode: got {came}{' and no memory' if memory is None else ''}, but the heads {heads} of "
+                         f"this model (first_guess='last_seen') look at what was seen of late. Pass states of `observe` "
+                         f"or `imagine` and memory=observed.memory (live.memory of a stream).")
+    drives = memory.pose.shape[0]
+    for name, shape in inputs(config).items():
+        value = getattr(memory, name)
+        if value is None or value.shape[-len(shape):] != shape or value.shape[0] != drives:
+            raise ValueError(f"decode: memory.{name} is {None if value is None else list(value.shape)}, expected "
+                             f"[{drives}, ..., {', '.join(map(str, shape))}]; this memory belongs to another model.")
+    flat = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[len(lead):]), states.vantage)
+    count = flat.last.shape[0]
+    if rows is not None:
+        return flat, jnp.asarray(rows, jnp.int32).reshape(-1)
+    if (lead[0] if lead else 1) != drives:
+        raise ValueError(f"decode: got states [{', '.join(map(str, (*lead, '...')))}] and a memory of {drives} drives; "
+                         f"the first axis of the states must count the drives. Pass rows= otherwise.")
+    return flat, jnp.repeat(jnp.arange(drives, dtype=jnp.int32), count // drives)
+
+
+def look(config: ModelConfig, memory: Memory, rows: Array, vantage: Vantage, heads: tuple[str, ...]) -> dict[str, Glimpse]:
+    """The memory as it looks from n vantages, for those of the heads that it can tell something.
+
+    Args:
+      config: of the model.
+      memory: of B drives.
+      rows: int32 [n], which of them each vantage belongs to.
+      vantage: [n].
+      heads: what is decoded.
+    """
+    heads = tuple(head for head in guessed_heads(config) if head in heads)
+    if not heads:
+        return {}
+    places = config.memory_frames
+    stop = vantage.last + (vantage.steps > 0)
+    index = stop[:, None] + jnp.arange(-places, 0, dtype=jnp.int32)[None]
+    known = (index >= vantage.first[:, None]) & (index >= 0)
+    index = jnp.clip(index, 0, memory.pose.shape[1] - 1)
+    pose = motion_ops.relative(jnp.broadcast_to(vantage.motion.pose[:, None], (*index.shape, 3)),
+                               memory.pose[rows[:, None], index])
+    glimpses = {}
+    if "occupancy" in heads:
+        glimpses["occupancy"] = _evidence(config, memory, rows, index, known, pose)
+    if "range_view" in heads or "image" in heads:
+        glimpses["range_view"] = view = _ranges(config, memory, rows, index, known, pose)
+        if "image" in heads:
+            glimpses["image"] = _image(config, memory, rows, index[:, -1], known[:, -1], pose[:, -1], view)
+    return {head: glimpses[head] for head in heads}
+
+
+def _ranges(config: ModelConfig, memory: Memory, rows: Array, index: Array, known: Array, pose: Array) -> Glimpse:
+    geometry = config.range_view
+    scans = memory.range_view[rows[:, None], index]
+    scans = scans.reshape(*index.shape, -1, 4)
+    points_m = motion_ops.into_frame(scans[..., :3], pose)
+    valid = (scans[..., 3] > 0.0) & jnp.expand_dims(known, -1)
+    splat = lambda part: reproject.onto_beams(reproject.splat(
+        points_m[:, part].reshape(len(rows), -1, 3), valid[:, part].reshape(len(rows), -1), geometry), geometry)
+    newest, older = splat(slice(-1, None)), splat(slice(None, -1))
+    moved = jnp.where(newest[..., 3:] > 0.0, newest, older)
+    still = scans[:, -1].reshape(*newest.shape)
+    fresh = known[:, -1].reshape(-1, 1, 1)
+    sky = reproject.move_sky(still, pose[:, -1], geometry) & fresh & (moved[..., 3] <= 0.0)
+    filled_m = reproject.fill_holes(moved[..., 3], sky, geometry)
+    return Glimpse(moved_m=moved[..., 3], newest_m=newest[..., 3], filled_m=filled_m, still_m=jnp.where(fresh, still[..., 3], -1.0),
+                   sky=sky.astype(jnp.float32), height_m=jnp.where(moved[..., 3] > 0.0, moved[..., 2], 0.0))
+
+
+def _image(config: ModelConfig, memory: Memory, rows: Array, index: Array, known: Array, pose: Array,
+           view: Glimpse) -> Glimpse:
+    image = memory.image[rows, index].astype(jnp.float32) / 255.0
+    moved, inside = reproject.move_image(image, view.filled_m, pose, memory.intrinsics[rows],
+                                         memory.camera_to_ego[rows], config.range_view)
+    covered = jnp.expand_dims((inside & known.reshape(-1, 1, 1)).astype(jnp.float32), -1)
+    return Glimpse(image=moved * covered, covered=covered)
+
+
+def _evidence(config: ModelConfig, memory: Memory, rows: Array, index: Array, known: Array, pose: Array) -> Glimpse:
+    frames, places = memory.pose.shape[1], index.shape[1]
+    which = (rows[:, None] * frames + index).reshape(-1)
+    scans_m = memory.range_view[..., 3].reshape(-1, config.range_view.rows, config.range_view.columns)
+    evidence = reproject.scan_evidence(scans_m, which, pose.reshape(-1, 3), config.voxels, config.range_view)
+    evidence = evidence.reshape(len(rows), places, *config.voxels.shape)
+    evidence = jnp.where(known.reshape(*known.shape, 1, 1, 1), evidence, 0.0)
+    weights = FADE ** jnp.arange(places - 2, -1, -1, dtype=jnp.float32).reshape(1, -1, 1, 1, 1)
+    older = (evidence[:, :-1] * weights).sum(axis=1)
+    return Glimpse(newest=evidence[:, -1], older=jnp.clip(older, -1.0, 1.0))

@@ -34,7 +34,7 @@ class Options:
     run: Annotated[pathlib.Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
     """The run's folder."""
     checkpoint: str = "latest"
-    """latest, best (validation loss) or a step."""
+    """latest, best (skill of imagined frames, docs/design.md) or a step."""
     data: Annotated[str | None, command_line.shown("PATH", "the run's")] = None
     """Another recording than the one that the run was trained on."""
     split: Annotated[str | None, command_line.shown("NAME", "the first validation split")] = None

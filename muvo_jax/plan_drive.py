@@ -14,7 +14,7 @@ import numpy as np
 import rich.table
 import tyro
 
-from muvo_jax import command_line, evaluate
+from muvo_jax import command_line, evaluation_report
 from muvo_jax import config as config_lib
 from muvo_jax.agents import closed_loop, environment, planners, rewards, sensitivity
 from muvo_jax.data import prepare
@@ -44,7 +44,7 @@ class Options:
     run: Annotated[pathlib.Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
     """The run's folder."""
     checkpoint: str = "latest"
-    """latest, best (validation loss) or a step."""
+    """latest, best (skill of imagined frames, docs/design.md) or a step."""
     episodes: int = 5
     """Drives of each driver, each with a seed of its own."""
     seconds: float = 20.0
@@ -112,7 +112,7 @@ def plan_drive(options: Options, show: screen.Screen) -> dict[str, Any]:
     folder = options.out or loaded.folder / "plan_drive"
     folder.mkdir(parents=True, exist_ok=True)
     numbers, page = folder / "plan_drive.json", folder / "plan_drive.md"
-    numbers.write_text(json.dumps(evaluate.json_ready(report), indent=1) + "\n", encoding="utf-8")
+    numbers.write_text(json.dumps(evaluation_report.json_ready(report), indent=1) + "\n", encoding="utf-8")
     page.write_text(markdown(report), encoding="utf-8")
     pictures = film(loaded, town, drives[PLANNED][0], options)
     for path in (numbers, page, canvas.save_gif(folder / "plan_drive.gif", pictures, world.step_s)):

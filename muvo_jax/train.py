@@ -310,7 +310,8 @@ def draw_preview(folder: pathlib.Path, validator: validation.Validator, variable
 def draw_curves(folder: pathlib.Path) -> None:
     """RUN/curves.png from RUN/metrics.jsonl."""
     records = run_folder.read_metrics(folder)
-    names = ("total", "psnr_db", "kl", "gradient_norm", "imagined_psnr_db", "imagined_chamfer_m", "imagined_iou_occ")
+    names = ("total", "psnr_db", "kl", "gradient_norm", "imagined_psnr_db", "imagined_chamfer_m",
+             "imagined_iou_occ_above", "skill")
     units = {"psnr_db": "dB", "imagined_psnr_db": "dB", "imagined_chamfer_m": "m"}
     plots = []
     for name in names:

@@ -8,8 +8,9 @@ import jax.numpy as jnp
 import muvo_jax
 
 
-def main(run: str) -> None:
-    model, variables = muvo_jax.load(run)
+def main(folder: str) -> None:
+    run = muvo_jax.load(folder)
+    model, variables = run.model, run.variables
     batch = muvo_jax.windows(run, count=2)
     past = batch.time_slice(0, batch.frames // 2)
 
@@ -19,7 +20,7 @@ def main(run: str) -> None:
     dream = muvo_jax.imagine(model, variables, key_imagine, observed.last, brake_or_go.at[..., 1].set(0.0), branches=16)
     print("16 futures of 8 steps for 2 starts:", dream.features.shape)
     predictions = muvo_jax.decode(model, variables, dream.states[:, 0, ::4], heads=("image", "occupancy"))
-    print("decoded, 1 branch, every fourth step:", {head: scales[1].shape for head, scales in predictions.items()})
+    print("decoded, 1 branch, every fourth step:", {head: predictions[head].shape for head in predictions})
 
 
 if __name__ == "__main__":

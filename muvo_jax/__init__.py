@@ -1,47 +1,53 @@
 """MUVO, a multimodal generative world model for driving, in JAX.
 
-    model, variables = muvo_jax.load("runs/town-tr")
-    batch = muvo_jax.windows("runs/town-tr", frames=6)
-    observed = muvo_jax.observe(model, variables, key, batch)
-    dream = muvo_jax.imagine(model, variables, key, observed.last, actions)
-    pictures = muvo_jax.decode(model, variables, dream.states, heads=("image", "occupancy"))
+    run = muvo_jax.load("runs/town-tr")
+    batch = muvo_jax.windows(run, frames=6)
+    observed = muvo_jax.observe(run.model, run.variables, key, batch)
+    dream = muvo_jax.imagine(run.model, run.variables, key, observed.last, actions)
+    predictions = muvo_jax.decode(run.model, run.variables, dream.states, heads=("image", "occupancy"))
+    predictions.image, predictions.at_scale(2).occupancy
 
-Everything is a pure function of explicit pytrees; see docs/design.md.
+Everything is a pure function of explicit pytrees, with arguments in one order: (model, variables, key, what goes in);
+see docs/design.md.
 """
 
 from muvo_jax import presets
+from muvo_jax.agents.environment import Environment
 from muvo_jax.config import Config, ModelConfig
 from muvo_jax.model.live import LiveState, observe_step, start_live
-from muvo_jax.model.rollout import decode, imagine, observe
+from muvo_jax.model.rollout import decode, imagine, imagine_step, observe
 from muvo_jax.model.world_model import WorldModel
-from muvo_jax.types import Batch, Dream, Gaussian, LatentState, Observed
+from muvo_jax.run import Run
+from muvo_jax.types import Batch, Dream, LatentState, Observed, Predictions
 
 __all__ = [
-    "Batch", "Config", "Dream", "Gaussian", "LatentState", "LiveState", "ModelConfig", "Observed", "WorldModel",
-    "decode", "imagine", "load", "observe", "observe_step", "presets", "start_live",
-    "windows",
+    "Batch", "Config", "Dream", "Environment", "LatentState", "LiveState", "ModelConfig", "Observed", "Predictions",
+    "Run", "WorldModel", "decode", "imagine", "imagine_step", "load", "observe", "observe_step", "presets",
+    "start_live", "windows",
 ]
 
 
-def load(run):
-    """Loads a trained run: `load("runs/town-tr") -> (model, variables)`.
+def load(run, checkpoint="latest"):
+    """Loads a trained run: `load("runs/town-tr") -> Run`.
 
     Args:
       run: folder that `python -m muvo_jax.train` wrote.
+      checkpoint: "latest", "best" (by validation loss) or a step.
 
     Raises:
-      muvo_jax.training.checkpoint.CheckpointError: if the folder holds no readable checkpoint.
+      muvo_jax.training.checkpoint.CheckpointError: if there is no such run or checkpoint, or none that can be read.
+      ValueError: if another version wrote it, with a schema or settings that this one does not know.
     """
-    from muvo_jax.training import checkpoint  # imported late: imagining needs no checkpoint library
+    from muvo_jax.training.checkpoint import load_run  # imported late: imagining needs no checkpoint library
 
-    return checkpoint.load(run)
+    return load_run(run, checkpoint)
 
 
 def windows(run, split=None, *, count=2, frames=None):
     """Windows of the recording that a run was trained on: `windows("runs/town-tr") -> Batch [count, frames, ...]`.
 
     Args:
-      run: folder that `python -m muvo_jax.train` wrote.
+      run: a Run, or the folder that `python -m muvo_jax.train` wrote.
       split: by default the first one that validates ("val_rl" of the town).
       count: how many windows, evenly spread over the split.
       frames: of each window, by default those of the run's evaluation (context and horizon).

@@ -14,17 +14,15 @@ import time
 import traceback
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import Any, TypeVar
 
 import jax
 import tyro
 
 from muvo_jax import config as config_lib
+from muvo_jax import run as run_lib
 from muvo_jax.data import schema, sources
 from muvo_jax.training import host, screen
-
-if TYPE_CHECKING:
-    from muvo_jax.training import checkpoint
 
 TRACEBACK_VARIABLE = "MUVO_JAX_TRACEBACK"
 EXPECTED_ERRORS = (ValueError, OSError, ArithmeticError)  # DataError, CheckpointError and NonFiniteLossError are these
@@ -152,7 +150,7 @@ def chosen_settings(options: Any, fields: Mapping[str, str]) -> dict[str, Any]:
     return {field: getattr(options, flag) for flag, field in fields.items() if getattr(options, flag) is not None}
 
 
-def load_run(run: pathlib.Path, which: str, show: screen.Screen) -> checkpoint.LoadedRun:
+def load_run(run: pathlib.Path, which: str, show: screen.Screen) -> run_lib.Run:
     """The run in a folder at what --checkpoint says; shows which damaged checkpoints were passed over.
 
     Raises:

@@ -129,7 +129,7 @@ def dream_window(model: world_model.WorldModel, variables: types.Variables, key:
         states = jax.tree.map(lambda seen, dreamt, branch=branch: jnp.concatenate([seen, dreamt[:, branch]], axis=1),
                               observed.states, imagined.states)
         decoded = rollout.decode(model, variables, states, heads)
-        futures.append(jax.device_get(protocol.finish({head: scales[1] for head, scales in decoded.items()})))
+        futures.append(jax.device_get(protocol.finish(decoded)))
     return futures
 
 

@@ -134,7 +134,7 @@ def functions(model: world_model.WorldModel, weights: Mapping[str, Any], config:
         return vars(dream.states)
 
     def decode(head, weights, state):
-        return rollout.decode(model, unflatten(weights), types.LatentState(**state), (head,))[head][1]
+        return rollout.decode(model, unflatten(weights), types.LatentState(**state), (head,))[head]
 
     temperature = jax.ShapeDtypeStruct((), jnp.float32)
     made: dict[str, tuple[Callable, tuple]] = {

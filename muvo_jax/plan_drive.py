@@ -16,12 +16,13 @@ import tyro
 
 from muvo_jax import command_line, evaluation_report
 from muvo_jax import config as config_lib
+from muvo_jax import run as run_lib
 from muvo_jax.agents import closed_loop, environment, planners, rewards, sensitivity
 from muvo_jax.data import prepare
 from muvo_jax.data.town import record, settings, simulator
 from muvo_jax.metrics import protocol
 from muvo_jax.model import rollout
-from muvo_jax.training import checkpoint, checkpoint_meta, screen
+from muvo_jax.training import checkpoint_meta, screen
 from muvo_jax.viz import canvas, sheets
 
 FIRST_SEED = 5_000  # no recorded drive has these seeds
@@ -80,7 +81,7 @@ def plan_drive(options: Options, show: screen.Screen) -> dict[str, Any]:
         raise ValueError(f"--episodes is {options.episodes} and --seconds {options.seconds}; both must be positive.")
     town = simulator.Town(settings.from_config(config))
     world = town_simulator(town, config)
-    imagination = environment.make(loaded.model, config, reward_config=rewards.RewardConfig(
+    imagination = environment.Environment.of_run(loaded, reward_config=rewards.RewardConfig(
         occupancy_scale=options.occupancy_scale, collision=5.0 if "occupancy" in config.model.heads else 0.0))
     planner = closed_loop.planning_driver(world, imagination, loaded.variables, *planner_of(options),
                                           horizon=options.horizon)
@@ -174,7 +175,7 @@ def town_truth(town: simulator.Town, state: simulator.TownState) -> dict[str, np
             "ego_motion": np.array([0.0, 0.0, 0.0, seen["speed_mps"]], np.float32)}
 
 
-def film(loaded: checkpoint.LoadedRun, town: simulator.Town, drive: closed_loop.Drive,
+def film(loaded: run_lib.Run, town: simulator.Town, drive: closed_loop.Drive,
          options: Options) -> list[np.ndarray]:
     """Frames of a planned drive: the town, what the model makes of it, what it expects at the end of its plan."""
     model, variables, key = loaded.model, loaded.variables, jax.random.key(options.seed)
@@ -184,7 +185,7 @@ def film(loaded: checkpoint.LoadedRun, town: simulator.Town, drive: closed_loop.
     views = []
     for latent in (states, jax.tree.map(lambda leaf: leaf[:, -1], dreamt.states)):
         decoded = rollout.decode(model, variables, latent, heads)
-        frames = jax.device_get(protocol.finish({head: scales[1] for head, scales in decoded.items()}))
+        frames = jax.device_get(protocol.finish(decoded))
         views.append(sheets.views_of_frames({head: value[None] for head, value in frames.items()}, 0))
     scene = sheets.Scene.of(loaded.config)
     pictures = []

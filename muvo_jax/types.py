@@ -10,7 +10,7 @@ Time: `action[t]` is applied from t to t+1.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
 import flax.struct
@@ -21,7 +21,6 @@ import numpy as np
 Array = jax.Array
 ArrayLike = jax.Array | np.ndarray
 Variables = Mapping[str, Any]  # {"params": ..., "batch_stats": ...}, plain nested dictionaries
-Predictions = dict[str, dict[int, Array]]  # head name -> scale (1, 2, 4; 1 is full size) -> array
 
 OCCUPANCY_EMPTY = 0
 OCCUPANCY_OCCUPIED = 1
@@ -163,16 +162,67 @@ class Gaussian(_Indexable):
 
 
 @flax.struct.dataclass
+class Motion(_Indexable):
+    """The car in the ego frame of an earlier moment (x forward, y left).
+
+    Attributes:
+      pose: float32 [..., 3], x (m), y (m), yaw (rad, counter-clockwise).
+      speed_mps: float32 [...].
+    """
+
+    pose: Array
+    speed_mps: Array
+
+
+@flax.struct.dataclass
+class Vantage(_Indexable):
+    """Where a state stands to what was observed: how decoders know from where they look at a Memory.
+
+    Attributes:
+      motion: Motion [...], the car in the ego frame of the memory's newest observation.
+      first: int32 [...], the memory's first observation that belongs to this drive.
+      last: int32 [...], the newest one that this state has seen.
+      steps: int32 [...], imagined since then; at 0 the state is that of the observation `last` itself, which its
+        decoders must not look up: their guess comes from the observations before it.
+    """
+
+    motion: Motion
+    first: Array
+    last: Array
+    steps: Array
+
+
+@flax.struct.dataclass
+class Memory(_Indexable):
+    """The last F observations as they came and where they were taken; held once, without axes of time or branches.
+
+    Attributes:
+      pose: float32 [B, F, 3], x, y, yaw of each in the ego frame of the newest, which is the last one.
+      range_view: float32 [B, F, Hr, Wr, 4], as Batch.range_view; None for a model without lidar.
+      image: uint8 [B, F, H, W, 3], as Batch.image; None for a model without camera.
+      intrinsics, camera_to_ego: float32 [B, 3, 3] and [B, 4, 4]; None without image.
+    """
+
+    pose: Array
+    range_view: Array | None = None
+    image: Array | None = None
+    intrinsics: Array | None = None
+    camera_to_ego: Array | None = None
+
+
+@flax.struct.dataclass
 class LatentState(_Indexable):
     """What the world model knows: the carry of the recurrence, for training, imagination, planning and live use.
 
     Attributes:
       deterministic: float32 [..., D], the recurrent state h; tokens [..., N, C] with the 2D latent.
       stochastic: float32 [..., S], the sampled state s; tokens [..., N, C] with the 2D latent.
+      vantage: Vantage [...] of a model that keeps track of its motion (ModelConfig.tracks_motion), else None.
     """
 
     deterministic: Array
     stochastic: Array
+    vantage: Vantage | None = None
 
     @property
     def features(self) -> Array:
@@ -207,11 +257,13 @@ class Observed(_Indexable):
       states: LatentState [B, T, ...], each with its posterior's sample, which is what decoders read (under the RSSM
         dropout of training, the recurrence itself may have gone on from the prior's).
       posterior, prior: Gaussian [B, T, S].
+      memory: Memory [B, ...] of the window, for a model with first_guess="last_seen"; `decode` takes it.
     """
 
     states: LatentState
     posterior: Gaussian
     prior: Gaussian
+    memory: Memory | None = None
 
     @property
     def last(self) -> LatentState:
@@ -236,3 +288,74 @@ class Dream(_Indexable):
     @property
     def features(self) -> Array:
         return self.states.features
+
+
+@flax.struct.dataclass
+class Predictions:
+    """What `decode` returns: for each decoded head an array [..., *size / scale, channels] at one scale or several.
+
+    `predictions.image` is the full size, `predictions.at_scale(2).image` half of it along every spatial axis. A head
+    whose name Python keeps for itself, and one whose name is in a variable, is read with brackets:
+    `predictions["continue"]`. Brackets take names only; `jax.tree.map(lambda leaf: leaf[:, 0], predictions)` indexes
+    all arrays.
+
+    Attributes:
+      arrays: head -> scale (1, 2, 4; 1 is full size) -> float32 [..., *size / scale, channels].
+      scale: the one that attributes and brackets read.
+    """
+
+    arrays: Mapping[str, Mapping[int, Array]]
+    scale: int = flax.struct.field(pytree_node=False, default=1)
+
+    @property
+    def heads(self) -> tuple[str, ...]:
+        """The heads that have this scale."""
+        return tuple(head for head, scales in self.arrays.items() if self.scale in scales)
+
+    def scales(self, head: str) -> Mapping[int, Array]:
+        """{scale: array} of a head.
+
+        Raises:
+          KeyError: if it was not decoded; names what was.
+        """
+        if head not in self.arrays:
+            raise KeyError(f"the head {head!r} was not decoded; these were: {', '.join(self.arrays) or 'none'}.")
+        return self.arrays[head]
+
+    def at_scale(self, scale: int) -> Predictions:
+        """The same predictions, read at 1 / scale of the size.
+
+        Raises:
+          ValueError: if no head has that scale; names those that there are.
+        """
+        found = sorted({found for scales in self.arrays.values() for found in scales})
+        if scale not in found:
+            raise ValueError(f"no decoded head has the scale {scale}; there are {', '.join(map(str, found))}.")
+        return self.replace(scale=scale)  # type: ignore[attr-defined]
+
+    def __getitem__(self, head: str) -> Array:
+        if not isinstance(head, str):
+            raise TypeError(f"predictions[{head!r}]: brackets take the name of a head, such as 'image'; to index all "
+                            f"arrays use jax.tree.map(lambda leaf: leaf[index], predictions).")
+        scales = self.scales(head)
+        if self.scale not in scales:
+            raise KeyError(f"the head {head!r} has no scale {self.scale}; it has {', '.join(map(str, scales))}.")
+        return scales[self.scale]
+
+    def __getattr__(self, name: str) -> Array:
+        if name.startswith("_") or name == "arrays":  # asked for by copying and pickling, before the fields are there
+            raise AttributeError(name)
+        try:
+            return self[name]
+        except KeyError as error:
+            raise AttributeError(f"Predictions.{name}: {error.args[0]}") from None
+
+    def __contains__(self, head: object) -> bool:
+        return head in self.heads
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.heads)
+
+    def __or__(self, other: Predictions) -> Predictions:
+        """The heads of both."""
+        return self.replace(arrays={**self.arrays, **other.arrays})  # type: ignore[attr-defined]

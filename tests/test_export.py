@@ -70,7 +70,7 @@ def test_a_sealed_model_gives_the_same_numbers_without_the_library(tmp_path):
     assert out["frame"].tolist() == [1, 1, 1]
     np.testing.assert_allclose(out["stochastic"], dream.states.stochastic, atol=1e-4)
     np.testing.assert_allclose(
-        out["action"], rollout.decode(model, variables, dream.states[:, -1], ("action",))["action"][1], atol=1e-4)
+        out["action"], rollout.decode(model, variables, dream.states[:, -1], ("action",)).action, atol=1e-4)
 
 
 def test_flattening_has_an_inverse():

@@ -24,11 +24,12 @@ ALLOWED = {
     "model": BASE | {"nn"},
     "objectives": BASE | {"nn", "model"},
     "metrics": BASE | {"nn", "model"},
-    "agents": BASE | {"nn", "model", "metrics"},
+    "run": {"types", "config", "model"},
+    "agents": BASE | {"nn", "model", "metrics", "run"},
     "data": BASE,
     "viz": BASE,
     "interop": BASE | {"nn", "model", "objectives", "metrics", "data", "training", "command_line"},
-    "training": BASE | {"nn", "model", "objectives", "metrics", "data"},
+    "training": BASE | {"nn", "model", "run", "objectives", "metrics", "data"},
 }
 
 
@@ -68,7 +69,8 @@ def test_importing_the_library_loads_no_checkpoint_data_or_plotting_code():
 
 def test_public_names_are_these():
     assert sorted(muvo_jax.__all__) == [
-        "Batch", "Config", "Dream", "Gaussian", "LatentState", "LiveState", "ModelConfig", "Observed", "WorldModel",
-        "decode", "imagine", "load", "observe", "observe_step", "presets", "start_live", "windows",
+        "Batch", "Config", "Dream", "Environment", "LatentState", "LiveState", "ModelConfig", "Observed",
+        "Predictions", "Run", "WorldModel", "decode", "imagine", "imagine_step", "load", "observe", "observe_step",
+        "presets", "start_live", "windows",
     ]
     assert all(getattr(muvo_jax, name) is not None for name in muvo_jax.__all__)

@@ -1,5 +1,10 @@
 """Batches check themselves and slice over time."""
 
+import copy
+import pickle
+
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -31,3 +36,46 @@ def test_latent_states_index_like_arrays_and_put_h_first():
     state = types.LatentState(deterministic=np.ones((3, 4, 2), np.float32), stochastic=np.zeros((3, 4, 1), np.float32))
     assert state[:, ::2].deterministic.shape == (3, 2, 2)
     np.testing.assert_array_equal(state.features[0, 0], [1, 1, 0])
+
+
+def predictions():
+    """[3, 8, 4, 1] at full size; the head `continue` has no other."""
+    image = {scale: jnp.full((3, 8 // scale, 4 // scale, 1), scale, jnp.float32) for scale in (1, 2)}
+    return types.Predictions({"image": image, "continue": {1: jnp.zeros((3, 1))}})
+
+
+def test_predictions_are_read_by_name_at_full_size_or_another():
+    decoded = predictions()
+    assert decoded.image.shape == (3, 8, 4, 1) and decoded["continue"].shape == (3, 1)
+    assert decoded.at_scale(2).image.shape == decoded.at_scale(2)["image"].shape == (3, 4, 2, 1)
+    assert decoded.at_scale(2).at_scale(1).image is decoded.image
+    assert decoded.heads == tuple(decoded) == ("image", "continue") and decoded.at_scale(2).heads == ("image",)
+    assert "image" in decoded and "depth" not in decoded and "continue" not in decoded.at_scale(2)
+    assert list(decoded.scales("image")) == [1, 2]
+    more = decoded | types.Predictions({"depth": {1: jnp.ones(3)}})
+    assert more.heads == ("image", "continue", "depth") and decoded.heads == ("image", "continue")
+
+
+def test_a_head_or_scale_that_is_not_there_is_named_with_those_that_are():
+    decoded = predictions()
+    with pytest.raises(AttributeError, match=r"Predictions.depth: the head 'depth' was not decoded; these were"):
+        _ = decoded.depth
+    with pytest.raises(KeyError, match="was not decoded; these were: image, continue"):
+        _ = decoded["depth"]
+    with pytest.raises(KeyError, match="the head 'continue' has no scale 2; it has 1"):
+        _ = decoded.at_scale(2)["continue"]
+    with pytest.raises(ValueError, match="no decoded head has the scale 3; there are 1, 2"):
+        decoded.at_scale(3)
+    with pytest.raises(TypeError, match="brackets take the name of a head"):
+        _ = decoded[:, 0]
+
+
+def test_predictions_are_a_pytree_through_jit_vmap_scan_and_copies():
+    decoded = predictions()
+    doubled = jax.jit(lambda tree: jax.tree.map(lambda leaf: 2 * leaf, tree))(decoded)
+    np.testing.assert_array_equal(doubled.at_scale(2).image, 4.0)
+    assert jax.vmap(lambda one: one.image.sum())(decoded).shape == (3,)
+    _, stacked = jax.lax.scan(lambda carry, one: (carry, one.at_scale(2)), 0, decoded)
+    assert stacked.image.shape == (3, 4, 2, 1) and stacked.at_scale(1).image.shape == (3, 8, 4, 1)
+    for other in (copy.deepcopy(decoded), pickle.loads(pickle.dumps(jax.device_get(decoded)))):
+        np.testing.assert_array_equal(other.image, decoded.image)

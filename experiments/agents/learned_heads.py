@@ -11,16 +11,15 @@ import jax.numpy as jnp
 import numpy as np
 
 import muvo_jax
-from muvo_jax.agents import kinematics
-from muvo_jax.training import checkpoint
+from muvo_jax.ops import motion as motion_ops
 
 
 def path(steps):
     """Poses [B, H, 3] that steps [B, H, 4] lead to."""
-    motion = kinematics.at_rest_of_frame(jnp.zeros(steps.shape[0]))
+    motion = motion_ops.at_rest_of_frame(jnp.zeros(steps.shape[0]))
     poses = []
     for index in range(steps.shape[1]):
-        motion = kinematics.moved(motion, steps[:, index])
+        motion = motion_ops.moved(motion, steps[:, index])
         poses.append(motion.pose)
     return np.stack(poses, axis=1)
 
@@ -30,9 +29,9 @@ def main():
     parser.add_argument("run")
     parser.add_argument("--windows", type=int, default=32)
     options = parser.parse_args()
-    run = checkpoint.load_run(options.run)
+    run = muvo_jax.load(options.run)
     context = run.config.data.context
-    batch = muvo_jax.windows(options.run, count=options.windows)
+    batch = muvo_jax.windows(run, count=options.windows)
     seen = batch.time_slice(0, context)
     observed = muvo_jax.observe(run.model, run.variables, jax.random.key(0), seen, sampled=False)
     dream = muvo_jax.imagine(run.model, run.variables, jax.random.key(0), observed.last,
@@ -42,15 +41,15 @@ def main():
     reward = batch.reward[:, context:]
     error = lambda value: np.abs(value - reward).mean()
     print(f"reward of {reward.size} imagined frames, mean absolute error: "
-          f"head {error(learned['reward'][1][..., 0]):.3f}, "
+          f"head {error(learned.reward[..., 0]):.3f}, "
           f"the last observed reward {error(batch.reward[:, context - 1:context]):.3f}, "
           f"their mean {error(reward.mean()):.3f}")
     last, steps = batch.ego_motion[:, context - 1], batch.ego_motion[:, context:]
-    paths = {"head": path(learned["ego_motion"][1]),
+    paths = {"head": path(learned.ego_motion),
              "the last observed motion going on": path(np.repeat(last[:, None], steps.shape[1], axis=1))}
     if run.config.contract.kinematics == "bicycle":
-        motion = kinematics.at_rest_of_frame(jnp.asarray(last[:, 3]))
-        paths["bicycle"] = kinematics.path(motion, jnp.asarray(batch.action[:, context - 1:-1]), run.config.contract,
+        motion = motion_ops.at_rest_of_frame(jnp.asarray(last[:, 3]))
+        paths["bicycle"] = motion_ops.path(motion, jnp.asarray(batch.action[:, context - 1:-1]), run.config.contract,
                                            run.config.data.stride).pose
     truth = path(steps)
     away = {name: np.linalg.norm(poses[:, -1, :2] - truth[:, -1, :2], axis=-1).mean() for name, poses in paths.items()}

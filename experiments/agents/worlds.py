@@ -6,7 +6,6 @@ import jax.numpy as jnp
 import muvo_jax
 from muvo_jax import presets
 from muvo_jax.agents import environment, rewards
-from muvo_jax.training import checkpoint
 
 
 def load(run: str | None, horizon: int) -> tuple[environment.Environment, environment.EnvParams]:
@@ -18,15 +17,15 @@ def load(run: str | None, horizon: int) -> tuple[environment.Environment, enviro
     if run is None:
         config = presets.get("tiny")
         model = muvo_jax.WorldModel(config.model)
-        world = environment.make(model, config, reward_config=rewards.RewardConfig(collision=0.0))
+        fresh = muvo_jax.Run(model, model.init(jax.random.key(0)), config)
+        world = muvo_jax.Environment.of_run(fresh, reward_config=rewards.RewardConfig(collision=0.0))
         latent = jax.tree.map(lambda leaf: 0.5 * jax.random.normal(jax.random.key(0), leaf.shape),
                               model.initial_state(64))
         bank = environment.StartBank(latent, jnp.linspace(0.0, 8.0, 64))
-        return world, world.params(model.init(jax.random.key(0)), bank, horizon)
-    loaded = checkpoint.load_run(run)
-    config = loaded.config
-    batch = muvo_jax.windows(run, "train", count=16)
+        return world, world.params(fresh.variables, bank, horizon)
+    loaded = muvo_jax.load(run)
+    batch = muvo_jax.windows(loaded, "train", count=16)
     observed = muvo_jax.observe(loaded.model, loaded.variables, jax.random.key(0), batch)
-    world = environment.make(loaded.model, config)
-    bank = environment.bank_of(observed, batch, skip=config.data.context - 1)
+    world = muvo_jax.Environment.of_run(loaded)
+    bank = world.starts(observed, batch, skip=loaded.config.data.context - 1)
     return world, world.params(loaded.variables, bank, horizon)

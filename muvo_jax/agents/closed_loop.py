@@ -17,8 +17,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from muvo_jax.agents import environment as environment_lib
-from muvo_jax.agents import kinematics, planners
+from muvo_jax.agents import planners
 from muvo_jax.model import live
+from muvo_jax.ops import motion as motion_ops
 from muvo_jax.types import Array, ArrayLike, LatentState, Variables
 
 
@@ -196,7 +197,7 @@ def plan_step(environment: environment_lib.Environment, planner: str, config: pl
     bank = environment_lib.StartBank(filtered.latent, speed_mps, route_map)
     horizon = memory.plan.shape[0]
     params = dataclasses.replace(environment.params(variables, bank, horizon), temperature=temperature)
-    state = environment_lib.EnvState(filtered.latent[0], kinematics.at_rest_of_frame(speed_mps[0]), jnp.int32(0),
+    state = environment_lib.EnvState(filtered.latent[0], motion_ops.at_rest_of_frame(speed_mps[0]), jnp.int32(0),
                                      jnp.int32(0), jnp.float32(0), jnp.bool_(False))
     objective = planners.imagined_returns(environment, params, state, discount=discount)
     plan = planners.PLANNERS[planner](objective, key, planners.shift(memory.plan), config)

@@ -17,10 +17,12 @@ import jax
 import jax.numpy as jnp
 
 from muvo_jax import config as config_lib
-from muvo_jax.agents import kinematics, rewards
+from muvo_jax import run as run_lib
+from muvo_jax.agents import rewards
 from muvo_jax.model import checks
 from muvo_jax.model.world_model import WorldModel
-from muvo_jax.types import Array, Batch, LatentState, Observed, Variables
+from muvo_jax.ops import motion as motion_ops
+from muvo_jax.types import Array, Batch, LatentState, Motion, Observed, Variables
 
 ACTION_CHANNELS = checks.ACTION_CHANNELS
 RewardFunction = Callable[[rewards.Moment], tuple[Array, Array, dict[str, Array]]]
@@ -75,7 +77,7 @@ class EnvState:
     """
 
     latent: LatentState
-    motion: kinematics.Motion
+    motion: Motion
     start: Array
     time: Array
     reward: Array
@@ -135,6 +137,16 @@ class Environment:
                              f"{self.contract.kinematics!r}, and this run trained no head ego_motion. Train it "
                              f"(--with-heads=ego_motion), or pass a reward_function of your own.")
 
+    @classmethod
+    def of_run(cls, run: run_lib.Run, *, learned_reward: bool = False, **options: Any) -> Environment:
+        """The environment of a run: model, contract and stride are its own; options as in Environment.
+
+        `learned_reward` takes reward and ends from the heads reward and continue (rewards.learned_reward).
+        """
+        if learned_reward:
+            options |= {"reward_function": rewards.learned_reward, "reward_heads": rewards.LEARNED_HEADS}
+        return cls(run.model, contract=run.contract, periods=run.config.data.stride, **options)
+
     @property
     def ego_path(self) -> Literal["bicycle", "ego_motion"] | None:
         """Where the imagined path comes from: the contract's kinematics, else the head, else there is none."""
@@ -168,6 +180,27 @@ class Environment:
         return jax.eval_shape(lambda variables, features: self._observe(features, self._decode(variables, features)[0]),
                               variables, features)
 
+    @staticmethod
+    def starts(observed: Observed, batch: Batch, *, skip: int = 0) -> StartBank:
+        """All frames of observed windows as start states; the first `skip` of each window are left out.
+
+        Args:
+          observed: Observed [B, T, ...] of `batch`.
+          batch: with speed_mps; its route_map comes along where there is one.
+          skip: frames whose latent has seen too little yet.
+
+        Raises:
+          ValueError: if the batch has no speed or no frame is left.
+        """
+        if batch.speed_mps is None:
+            raise ValueError("Environment.starts: Batch.speed_mps is None; imagined drives need the speed at their "
+                             "start.")
+        if not 0 <= skip < batch.frames:
+            raise ValueError(f"Environment.starts: skip is {skip}, but windows have {batch.frames} frames.")
+        merge = lambda leaf: jnp.asarray(leaf[:, skip:]).reshape(-1, *leaf.shape[2:])
+        return StartBank(jax.tree.map(merge, observed.states), merge(batch.speed_mps),
+                         None if batch.route_map is None else merge(batch.route_map))
+
     def params(self, variables: Variables, bank: StartBank, horizon: int, temperature: float = 1.0) -> EnvParams:
         """Checks and packs what the environment runs on.
 
@@ -184,7 +217,7 @@ class Environment:
     def reset(self, key: Array, params: EnvParams) -> tuple[Any, EnvState]:
         """Draws a start from the bank: (observation, state)."""
         start = jax.random.randint(key, (), 0, params.bank.size)
-        state = EnvState(params.bank.latent[start], kinematics.at_rest_of_frame(params.bank.speed_mps[start]),
+        state = EnvState(params.bank.latent[start], motion_ops.at_rest_of_frame(params.bank.speed_mps[start]),
                          start, jnp.int32(0), jnp.float32(0), jnp.bool_(False))
         return self.observe(state, params), state
 
@@ -204,9 +237,9 @@ class Environment:
         full, for_reward = self._decode(params.variables, latent.features)
         motion = state.motion
         if self.ego_path == "bicycle":
-            motion = kinematics.drive(motion, action, self.contract, self.periods)
+            motion = motion_ops.drive(motion, action, self.contract, self.periods)
         elif self.ego_path == "ego_motion":
-            motion = kinematics.moved(motion, full["ego_motion"])
+            motion = motion_ops.moved(motion, full["ego_motion"])
         route_map = None if params.bank.route_map is None else params.bank.route_map[state.start]
         moment = rewards.Moment(state.motion, motion, action, latent.features, for_reward, route_map)
         reward, terminated, terms = self._reward(moment)
@@ -232,10 +265,10 @@ class Environment:
         names = self.decoded_heads if heads is None else heads
         if not names:
             return {}, {}
-        scales = self.model.decode(variables, features, names)
-        full = {name: scales[name][1] for name in names}
+        predictions = self.model.decode(variables, features, names)
+        full = {name: predictions[name] for name in names}
         return full, full if "occupancy" not in names else {
-            **full, "occupancy": scales["occupancy"][self.reward_config.occupancy_scale]}
+            **full, "occupancy": predictions.at_scale(self.reward_config.occupancy_scale).occupancy}
 
     def _observe(self, features: Array, decoded: dict[str, Array]) -> Any:
         if self.observation == "features":
@@ -243,31 +276,7 @@ class Environment:
         return {name: decoded[name] for name in self.observation}
 
     def _checked(self, action: Array) -> Array:
-        shape = jnp.shape(action)
-        if shape != (ACTION_CHANNELS,):
-            raise ValueError(f"Environment.step: got an action {list(shape)}, expected [2] (acceleration, steering).")
-        checks.action_values(action, "Environment.step")
-        return jnp.clip(jnp.asarray(action, jnp.float32), -1.0, 1.0)
-
-
-def bank_of(observed: Observed, batch: Batch, *, skip: int = 0) -> StartBank:
-    """All frames of observed windows as start states; the first `skip` of each window are left out.
-
-    Args:
-      observed: Observed [B, T, ...] of `batch`.
-      batch: with speed_mps; its route_map comes along where there is one.
-      skip: frames whose latent has seen too little yet.
-
-    Raises:
-      ValueError: if the batch has no speed or no frame is left.
-    """
-    if batch.speed_mps is None:
-        raise ValueError("bank_of: Batch.speed_mps is None; imagined drives need the speed at their start.")
-    if not 0 <= skip < batch.frames:
-        raise ValueError(f"bank_of: skip is {skip}, but windows have {batch.frames} frames.")
-    merge = lambda leaf: jnp.asarray(leaf[:, skip:]).reshape(-1, *leaf.shape[2:])
-    return StartBank(jax.tree.map(merge, observed.states), merge(batch.speed_mps),
-                     None if batch.route_map is None else merge(batch.route_map))
+        return jnp.clip(checks.one_action(action, (), "Environment.step"), -1.0, 1.0)
 
 
 @functools.partial(jax.jit, static_argnames=("environment", "horizon"))
@@ -288,14 +297,4 @@ def play(environment: Environment, params: EnvParams, key: Array, state: EnvStat
     actions = None if callable(driver) else driver
     _, (states, transitions) = jax.lax.scan(step, state, (jax.random.split(key, horizon), actions))
     return states, transitions
-
-
-def make(model: WorldModel, config: config_lib.Config, *, learned_reward: bool = False, **options: Any) -> Environment:
-    """The environment of a run: contract and stride come from its config; options as in Environment.
-
-    `learned_reward` takes reward and ends from the heads reward and continue (rewards.learned_reward).
-    """
-    if learned_reward:
-        options |= {"reward_function": rewards.learned_reward, "reward_heads": rewards.LEARNED_HEADS}
-    return Environment(model, contract=config.contract, periods=config.data.stride, **options)
 

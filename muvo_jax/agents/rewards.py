@@ -16,8 +16,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from muvo_jax import config as config_lib
-from muvo_jax.agents import kinematics
-from muvo_jax.types import Array
+from muvo_jax.ops import motion as motion_ops
+from muvo_jax.types import Array, Motion
 
 
 @dataclasses.dataclass(frozen=True)
@@ -74,15 +74,15 @@ class Moment:
     """One imagined step, all that a reward may look at. Leading axes: any.
 
     Attributes:
-      before, after: kinematics.Motion at the step's two ends, in the ego frame of the start.
+      before, after: Motion at the step's two ends, in the ego frame of the start.
       action: float32 [..., 2], applied in between.
       features: float32 [..., F], of the latent after the step.
       decoded: head -> full-size prediction after the step, for the heads that were asked for.
       route_map: uint8 or float32 [..., 64, 64], the last observed one, or None.
     """
 
-    before: kinematics.Motion
-    after: kinematics.Motion
+    before: Motion
+    after: Motion
     action: Array
     features: Array
     decoded: Mapping[str, Array]
@@ -189,8 +189,8 @@ def discomfort(moment: Moment, contract: config_lib.ActionContract, step_s: floa
     Without a bicycle they come from the motion: change of speed and speed times turn, per second.
     """
     if contract.kinematics == "bicycle":
-        along = kinematics.acceleration_mps2(moment.action, contract)
-        across = moment.after.speed_mps**2 * kinematics.curvature_per_m(moment.action, contract)
+        along = motion_ops.acceleration_mps2(moment.action, contract)
+        across = moment.after.speed_mps**2 * motion_ops.curvature_per_m(moment.action, contract)
     else:
         along = (moment.after.speed_mps - moment.before.speed_mps) / step_s
         across = moment.after.speed_mps * (moment.after.pose[..., 2] - moment.before.pose[..., 2]) / step_s

@@ -59,7 +59,7 @@ def measure(simulator: closed_loop.Simulator, truth: Callable[[Any], Mapping[str
                     for drive in range(len(seeds))] for plan in (0, 1)]
         shown = [[follow(simulator, truth, state, action, horizon) for state in states] for action in pair]
         scores[name] = {
-            head: score(head, [np.stack([scales[head][1] for scales in drives]) for drives in decoded],
+            head: score(head, [np.stack([predictions[head] for predictions in drives]) for drives in decoded],
                         [np.stack([frames[head] for frames in drives]) for drives in shown]) for head in heads}
     return scores
 

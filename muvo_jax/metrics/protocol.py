@@ -82,7 +82,7 @@ def _predict(model, variables, key, batch, other_action, context, horizon, sampl
     states = jax.tree.map(lambda seen, dreamt: jnp.concatenate([seen, *jnp.unstack(dreamt, axis=1)], axis=1),
                           observed.states, dream.states)
     heads = shown_heads(model.config)
-    frames = finish({head: scales[1] for head, scales in model.decode(variables, states.features, heads).items()})
+    frames = finish(model.decode(variables, states.features, heads))
     end = context + horizon
     return ({name: value[:, :end] for name, value in frames.items()},
             None if other_action is None else {name: value[:, end:] for name, value in frames.items()})
@@ -93,13 +93,13 @@ def shown_heads(config: config_lib.ModelConfig) -> tuple[str, ...]:
     return tuple(head for head in (*HEADS, *maps.FIELDS) if head in config.heads)
 
 
-def finish(full: Mapping[str, types.Array]) -> dict[str, types.Array]:
+def finish(predictions: types.Predictions) -> dict[str, types.Array]:
     """Full-scale predictions as frames: the image clipped to [0, 1], occupancy decided at probability 0.5.
 
     What optional heads draw stands under the names of types.Batch (maps.finish).
     """
-    frames = {head: value for head, value in full.items() if head not in maps.FIELDS}
-    frames |= maps.finish({head: value for head, value in full.items() if head in maps.FIELDS})
+    frames = {head: predictions[head] for head in predictions if head not in maps.FIELDS}
+    frames |= maps.finish({head: predictions[head] for head in predictions if head in maps.FIELDS})
     if "image" in frames:
         frames["image"] = jax.numpy.clip(frames["image"], 0.0, 1.0)
     if "occupancy" in frames:

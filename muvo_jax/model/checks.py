@@ -51,6 +51,20 @@ def actions(given, lead: tuple[int, ...], horizon: int | None, branches: int | N
     return (shape[rank] if has_branches else branches), shape[-2]
 
 
+def one_action(given, lead: tuple[int, ...], where: str, name: str = "action") -> jax.Array:
+    """Returns the action [*lead, 2] of one step as float32.
+
+    Raises:
+      ValueError: for another shape, or for concrete values that are not finite or outside [-1, 1].
+    """
+    expected = (*lead, ACTION_CHANNELS)
+    if jnp.shape(given) != expected:
+        raise ValueError(f"{where}: got {name} {list(jnp.shape(given))}, expected {list(expected)} (acceleration, "
+                         f"steering).")
+    action_values(given, where)
+    return jnp.asarray(given, jnp.float32)
+
+
 def action_values(given, where: str) -> None:
     """Raises ValueError where a concrete action is not finite or outside [-1, 1]; traced values pass."""
     if isinstance(given, jax.core.Tracer):

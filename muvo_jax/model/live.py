@@ -61,10 +61,7 @@ def observe_step(model: WorldModel, variables: Variables, live: LiveState, obser
       ValueError: if shapes or dtypes do not fit the model, or an action is out of range.
     """
     batch_size = live.frame.shape[0]
-    action = jnp.asarray(previous_action, jnp.float32)
-    if action.shape != (batch_size, checks.ACTION_CHANNELS):
-        raise ValueError(f"observe_step: got previous_action {list(action.shape)}, expected [{batch_size}, 2].")
-    checks.action_values(previous_action, "observe_step")
+    action = checks.one_action(previous_action, (batch_size,), "observe_step", "previous_action")
     checks.state(model, live.latent)
     fields = {name: jnp.asarray(value) if name in UNTIMED_FIELDS else jnp.expand_dims(jnp.asarray(value), 1)
               for name, value in observation.items()}

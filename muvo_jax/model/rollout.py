@@ -152,7 +152,7 @@ def imagine(model: WorldModel, variables: Variables, key: jax.Array, state: Late
     """
     lead = checks.state(model, state)
     count = math.prod(lead)
-    keys = sample_keys(key.reshape(-1) if lead and getattr(key, "shape", None) == lead else key, count)
+    keys = _keys_of(key, lead)
     driver: jax.Array | jax.tree_util.Partial
     if callable(actions_or_policy):
         policy = actions_or_policy
@@ -166,6 +166,32 @@ def imagine(model: WorldModel, variables: Variables, key: jax.Array, state: Late
     dream = _imagine(model, variables, keys, flat, driver, jnp.float32(temperature), horizon, branches, sampled,
                      same_noise)
     return jax.tree.map(lambda leaf: leaf.reshape(*lead, *leaf.shape[1:]), dream)
+
+
+def imagine_step(model: WorldModel, variables: Variables, key: jax.Array, state: LatentState, action: ArrayLike, *,
+                 sampled: bool = True, temperature: float | jax.Array = 1.0) -> LatentState:
+    """One step of `imagine`: where an action leads. What a search over a tree calls; compiled once per model and shape.
+
+    Args:
+      model, variables: the model.
+      key: typed key, of which state i of all takes fold_in(key, i), or one per state [*L], taken as it is.
+      state: LatentState [*L, ...] with any leading axes.
+      action: [*L, 2] in [-1, 1], applied at `state`.
+      sampled, temperature: as in `imagine`.
+
+    Returns:
+      LatentState [*L, ...]. It is step k of the `imagine` whose key for the state is a, given the key
+      fold_in(fold_in(a, k), 0).
+
+    Raises:
+      ValueError: if shapes, values or key do not fit.
+    """
+    lead = checks.state(model, state)
+    action = checks.one_action(action, lead, "imagine_step")
+    keys = _keys_of(key, lead)
+    flat = jax.tree.map(lambda leaf: leaf.reshape(len(keys), *leaf.shape[len(lead):]), state)
+    after = _imagine_one(model, variables, keys, flat, action.reshape(len(keys), -1), jnp.float32(temperature), sampled)
+    return jax.tree.map(lambda leaf: leaf.reshape(*lead, *leaf.shape[1:]), after)
 
 
 def decode(model: WorldModel, variables: Variables, states: LatentState | Dream | jax.Array,
@@ -182,7 +208,12 @@ def learned_policy(model: WorldModel, variables: Variables) -> Policy:
 
 def _decode_action(model, variables, key, features):
     del key
-    return model.decode(variables, features, ("action",))["action"][1]
+    return model.decode(variables, features, ("action",)).action
+
+
+def _keys_of(key, lead):
+    """One key per state of the leading axes, flat."""
+    return sample_keys(key.reshape(-1) if lead and getattr(key, "shape", None) == lead else key, math.prod(lead))
 
 
 def _fold_each(key, count):
@@ -203,6 +234,11 @@ def _decode(model, variables, features, heads):
     return model.decode(variables, features, heads)
 
 
+@functools.partial(jax.jit, static_argnames=("model", "sampled"))
+def _imagine_one(model, variables, keys, state, action, temperature, sampled):
+    return _advance(model, variables, keys, state, action, temperature if sampled else None)[0]
+
+
 @functools.partial(jax.jit, static_argnames=("model", "horizon", "branches", "sampled", "same_noise"))
 def _imagine(model, variables, keys, state, driver, temperature, horizon, branches, sampled, same_noise):
     """Merges branches into the batch, scans, and parts them again."""
@@ -220,8 +256,16 @@ def _imagine(model, variables, keys, state, driver, temperature, horizon, branch
     return jax.tree.map(lambda leaf: leaf.reshape(batch_size, branches, *leaf.shape[1:]), dream)
 
 
+def _advance(model, variables, keys, state, action, temperature):
+    """One imagined step of states [B, ...] under noise from their keys; at the mean where temperature is None."""
+    noise = jnp.zeros_like(state.stochastic)
+    if temperature is not None:
+        shape = state.stochastic.shape[1:]
+        noise = temperature * jax.vmap(lambda key: jax.random.normal(key, shape))(keys)
+    return model.imagine_step(variables, noise, action, state)
+
+
 def _imagine_flat(model, variables, keys_noise, keys_policy, state, driver, *, temperature, horizon):
-    shape = state.stochastic.shape[1:]
     fold = jax.vmap(jax.random.fold_in, (0, None))
 
     def step(state, inputs):
@@ -229,12 +273,7 @@ def _imagine_flat(model, variables, keys_noise, keys_policy, state, driver, *, t
         if callable(driver):
             keys = fold(fold(keys_policy, index), 1)
             action = checks.policy_action(jax.vmap(driver)(keys, state.features), state.features)
-        if temperature is None:
-            noise = jnp.zeros_like(state.stochastic)
-        else:
-            keys = fold(fold(keys_noise, index), 0)
-            noise = temperature * jax.vmap(lambda key: jax.random.normal(key, shape))(keys)
-        state, prior = model.imagine_step(variables, noise, action, state)
+        state, prior = _advance(model, variables, fold(fold(keys_noise, index), 0), state, action, temperature)
         return state, (state, action, prior)
 
     actions = None if callable(driver) else _swap_time(driver)

@@ -73,7 +73,7 @@ class Network(linen.Module):
     def imagine_step(self, *args):
         return self.transition.imagine_step(*args)
 
-    def decode(self, features: jax.Array, names: tuple[str, ...]) -> Predictions:
+    def decode(self, features: jax.Array, names: tuple[str, ...]) -> dict[str, dict[int, jax.Array]]:
         raw = {name: self.decoders[name](self.read(features, name)) for name in names}
         if self.config.first_guess == "training_mean":
             raw |= {name: guess(raw[name]) for name, guess in self.first_guess.items() if name in names}
@@ -87,7 +87,7 @@ class Network(linen.Module):
         return tokens.pool(features, self.config) if group is None else tokens.read(features, group, self.config)
 
     def everything(self, frames: dict[str, jax.Array], noise: StepNoise, action: jax.Array, state: LatentState,
-                   is_first: jax.Array) -> Predictions:
+                   is_first: jax.Array) -> dict[str, dict[int, jax.Array]]:
         """Touches every parameter once; only its shapes are ever computed."""
         state, _ = self.observe_step(noise, action, state, self.encode(frames, norm.Mode(), None), is_first)
         return self.decode(state.features, self.config.heads)
@@ -216,8 +216,8 @@ class WorldModel:
           heads: which ones; None for all that the model has. Only these are computed.
 
         Returns:
-          head -> scale -> float32 [..., *size / scale, channels]: image in [0, 1] where trained (no clipping),
-          range_view in metres, occupancy as logits [..., X, Y, Z, 2], action in (-1, 1) [..., 2] at scale 1; what other
+          Predictions, float32 [..., *size / scale, channels]: image in [0, 1] where trained (no clipping), range_view
+          in metres, occupancy as logits [..., X, Y, Z, 2], action in (-1, 1) [..., 2], at full size only; what other
           heads return, model/heads.py says.
 
         Raises:
@@ -234,8 +234,8 @@ class WorldModel:
             raise ValueError(f"decode: got features {list(features.shape)}, expected "
                              f"[{', '.join(map(str, ('...', *shape)))}] for the {self.config.latent} latent.")
         flat = self._apply(variables, "decode", features.reshape(-1, *shape), names)
-        return {name: {scale: _finished(value, name, scale, self.config).reshape(*lead, *value.shape[1:])
-                       for scale, value in scales.items()} for name, scales in flat.items()}
+        return Predictions({name: {scale: _finished(value, name, scale, self.config).reshape(*lead, *value.shape[1:])
+                                   for scale, value in scales.items()} for name, scales in flat.items()})
 
     def _apply(self, variables: Variables, method: str, *args, **options) -> Any:
         return Network(self.config).apply(variables, *args, method=method, **options)

@@ -30,7 +30,7 @@ def loss_sums(predictions: types.Predictions, batch: types.Batch, observed: type
     """Reduces predictions and targets to sums that add over samples and devices.
 
     Args:
-      predictions: what `decode` returns for the states of every frame: {head: {scale: [B, T, ...]}}.
+      predictions: what `decode` returns for the states of every frame, [B, T, ...] each.
       batch: the targets.
       observed: posterior and prior of every frame.
       model, loss: weights and units.
@@ -44,7 +44,7 @@ def loss_sums(predictions: types.Predictions, batch: types.Batch, observed: type
                                                              balance=loss.kl_balance, numerics=model.numerics)}
     for head in model.heads:
         check_head(head, predictions, batch, model, loss)
-        sums |= terms.TABLE[head].sums(terms.Inputs(predictions[head], batch, model, loss, keys, frozen))
+        sums |= terms.TABLE[head].sums(terms.Inputs(predictions.scales(head), batch, model, loss, keys, frozen))
     return sums
 
 
@@ -94,5 +94,6 @@ def check_head(head: str, predictions: types.Predictions, batch: types.Batch, mo
             raise ValueError(f"losses: {what}, but the batch has no {field}. {remedy} or train on a recording that has "
                              f"it.")
     scales = heads_lib.TABLE[head].scales
-    if set(predictions[head]) != set(scales):
-        raise ValueError(f"losses: head {head!r} predicts scales {sorted(predictions[head])}, expected {scales}.")
+    predicted = sorted(predictions.scales(head))
+    if predicted != sorted(scales):
+        raise ValueError(f"losses: head {head!r} predicts scales {predicted}, expected {scales}.")

@@ -20,6 +20,7 @@ import jax
 import orbax.checkpoint as ocp
 
 from muvo_jax import config as config_lib
+from muvo_jax import run as run_lib
 from muvo_jax import types
 from muvo_jax.model import world_model
 from muvo_jax.training import checkpoint_meta, integrity
@@ -48,29 +49,6 @@ class Restored:
     step: int
     data_state: Any
     meta: Mapping[str, Any]
-    warnings: tuple[str, ...]
-
-
-@dataclasses.dataclass(frozen=True)
-class LoadedRun:
-    """A trained model and where it came from.
-
-    Attributes:
-      config: the whole configuration of the run.
-      model: its world model.
-      variables: {"params", "batch_stats"} on the first device.
-      step: updates done.
-      folder: the run's folder.
-      provenance: what the model was trained on.
-      warnings: damaged checkpoints that were passed over.
-    """
-
-    config: config_lib.Config
-    model: world_model.WorldModel
-    variables: types.Variables
-    step: int
-    folder: pathlib.Path
-    provenance: Mapping[str, Any]
     warnings: tuple[str, ...]
 
 
@@ -214,7 +192,7 @@ def save_variables(run_folder: str | os.PathLike, step: int, variables: types.Va
     return folder
 
 
-def load_run(run: str | os.PathLike, which: int | str = "latest") -> LoadedRun:
+def load_run(run: str | os.PathLike, which: int | str = "latest") -> run_lib.Run:
     """Loads a trained model for inference onto the first device, wherever it was trained.
 
     Args:
@@ -240,16 +218,10 @@ def load_run(run: str | os.PathLike, which: int | str = "latest") -> LoadedRun:
             meta = checkpoint_meta.read(path)
             config = config_lib.Config.from_dict(meta["config"])
             variables = _restore_variables(path / "variables")
-            return LoadedRun(config, world_model.WorldModel(config.model), variables, step, folder, meta["provenance"],
-                             tuple(warnings))
+            return run_lib.Run(world_model.WorldModel(config.model), variables, config, step, folder,
+                               meta["provenance"], tuple(warnings))
         warnings.append(f"checkpoint {path} is damaged: {reason}; trying the one before.")
     raise CheckpointError(f"no readable checkpoint in {checkpoints}: " + " ".join(warnings))
-
-
-def load(run: str | os.PathLike) -> tuple[world_model.WorldModel, types.Variables]:
-    """Returns (model, variables) of the newest readable checkpoint of a run; see `load_run` for more and for errors."""
-    loaded = load_run(run)
-    return loaded.model, loaded.variables
 
 
 def _candidates(checkpoints: pathlib.Path, found: list[int], which: int | str) -> list[int]:

@@ -196,7 +196,7 @@ def forward(params: Any, batch_stats: Any, batch: types.Batch, keys: types.Array
     if train:
         features = _and_imagined(model, variables, observed, batch.action, keys)
         features, batch = _some_frames(features, batch, keys, config.train.decode_frames)
-    predictions: types.Predictions = {}
+    predictions = types.Predictions({})
     for head in model.config.heads:
         decode = functools.partial(model.decode, heads=(head,))
         predictions |= maybe_remat(decode)(variables, features)
@@ -204,7 +204,7 @@ def forward(params: Any, batch_stats: Any, batch: types.Batch, keys: types.Array
                          axis_name=axis_name, frozen=frozen)
     metrics = dict(terms)
     if batch.image is not None and "image" in predictions:
-        metrics["psnr_db"] = _mean(image_metrics.frame_psnr_db(predictions["image"][1], batch.image), axis_name)
+        metrics["psnr_db"] = _mean(image_metrics.frame_psnr_db(predictions.image, batch.image), axis_name)
     return terms["total"], (metrics, batch_stats)
 
 

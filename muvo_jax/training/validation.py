@@ -10,6 +10,7 @@ import jax
 import numpy as np
 
 from muvo_jax import config as config_lib
+from muvo_jax import run as run_lib
 from muvo_jax import types
 from muvo_jax.data import pipeline, prepare, schema, sources
 from muvo_jax.metrics import baselines, protocol, skill
@@ -84,10 +85,10 @@ def windows(frames: pipeline.Frames, split: str, count: int) -> Iterator[protoco
         yield protocol.Windows(entry.batch, drives, frames.actions(entry.others))
 
 
-def windows_of_run(run: str | os.PathLike, split: str | None = None, *, count: int,
+def windows_of_run(run: run_lib.Run | str | os.PathLike, split: str | None = None, *, count: int,
                    frames: int | None = None) -> types.Batch:
     """See muvo_jax.windows."""
-    config = checkpoint.load_run(run).config
+    config = (run if isinstance(run, run_lib.Run) else checkpoint.load_run(run)).config
     recording = sources.open_configured(config)
     held_out = [name for name in recording.description.splits if name != "train"]
     split = split or (held_out or ["train"])[0]

@@ -93,10 +93,10 @@ def test_gradients_reach_actions_and_a_predicted_collision_ends_the_drive():
 def test_the_bank_holds_every_frame_after_the_first_ones():
     states = jax.tree.map(lambda leaf: jnp.stack([leaf[:3], leaf[2:]]), bank().latent)
     batch = Batch(np.zeros((2, 3, 2), np.float32), np.zeros((2, 3), bool), speed_mps=np.arange(6.0).reshape(2, 3))
-    made = environment_lib.bank_of(Observed(states, None, None), batch, skip=1)
+    made = environment_lib.Environment.starts(Observed(states, None, None), batch, skip=1)
     assert made.size == 4 and made.speed_mps.tolist() == [1, 2, 4, 5] and made.route_map is None
     with pytest.raises(ValueError, match="skip is 3"):
-        environment_lib.bank_of(Observed(states, None, None), batch, skip=3)
+        environment_lib.Environment.starts(Observed(states, None, None), batch, skip=3)
 
 
 def test_what_does_not_fit_is_refused():

@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 from muvo_jax import config as config_lib
-from muvo_jax.agents import kinematics, rewards
+from muvo_jax.agents import rewards
 from muvo_jax.data.town import renderer, simulator
+from muvo_jax.ops import motion as motion_ops
 
 CONTRACT = config_lib.ActionContract()
 GRID = config_lib.VoxelGrid((16, 16, 4), 1.0, (-8.0, -8.0, -1.5))
@@ -17,9 +18,9 @@ CONFIG = rewards.RewardConfig()
 
 
 def moment(speed=10.0, action=(0.0, 0.0), **fields):
-    before = kinematics.at_rest_of_frame(jnp.float32(speed))
+    before = motion_ops.at_rest_of_frame(jnp.float32(speed))
     action = jnp.asarray(action, jnp.float32)
-    return rewards.Moment(before, kinematics.drive(before, action, CONTRACT, 2), action, jnp.zeros((3,)),
+    return rewards.Moment(before, motion_ops.drive(before, action, CONTRACT, 2), action, jnp.zeros((3,)),
                           **{"decoded": {}} | fields)
 
 
@@ -38,14 +39,14 @@ def test_the_ego_path_is_the_towns():
     for action in actions:
         for _ in range(2):
             pose, speed = simulator.bicycle(pose, speed, action, CONTRACT)
-    motion = kinematics.path(kinematics.at_rest_of_frame(jnp.float32(3.0)), jnp.asarray(actions), CONTRACT, 2)
+    motion = motion_ops.path(motion_ops.at_rest_of_frame(jnp.float32(3.0)), jnp.asarray(actions), CONTRACT, 2)
     assert motion.pose.shape == (12, 3) and motion.speed_mps.shape == (12,)
     np.testing.assert_allclose(motion.pose[-1], pose, atol=1e-4)
     np.testing.assert_allclose(motion.speed_mps[-1], speed, atol=1e-5)
 
 
 def test_braking_by_hand():
-    motion = kinematics.drive(kinematics.at_rest_of_frame(jnp.float32(1.0)), jnp.array([-1.0, 0.5]), CONTRACT, 2)
+    motion = motion_ops.drive(motion_ops.at_rest_of_frame(jnp.float32(1.0)), jnp.array([-1.0, 0.5]), CONTRACT, 2)
     # 6 m/s2 for 0.1 s: 1.0 -> 0.4 m/s over 0.07 m, then 0.4 -> 0 (not -0.2) over 0.02 m.
     np.testing.assert_allclose(motion.speed_mps, 0.0, atol=1e-7)
     np.testing.assert_allclose(motion.pose[2], -0.09 * np.tan(0.3) / 2.9, rtol=1e-5)
@@ -54,7 +55,7 @@ def test_braking_by_hand():
 
 def test_paths_of_unknown_kinematics_are_refused():
     with pytest.raises(ValueError, match=r"contract\.kinematics is 'none'"):
-        kinematics.drive(moment().before, jnp.zeros((2,)), dataclasses.replace(CONTRACT, kinematics="none"))
+        motion_ops.drive(moment().before, jnp.zeros((2,)), dataclasses.replace(CONTRACT, kinematics="none"))
 
 
 def test_only_what_stands_at_the_height_of_the_car_counts():

@@ -58,10 +58,10 @@ def test_there_and_back(tiny, tmp_path):
     config, variables, state_dict = tiny
     torch_writer.write_zip(tmp_path / "a.ckpt", checkpoint_of(state_dict))
     run_convert(tmp_path / "a.ckpt", tmp_path / "runs" / "a")
-    model, loaded = muvo_jax.load(tmp_path / "runs" / "a")
+    run = muvo_jax.load(tmp_path / "runs" / "a")
     for field in ("numerics", "latent", "variant", "heads", "navigation", "backbone", "image_size", "range_view"):
-        assert getattr(model.config, field) == getattr(config, field)
-    jax.tree.map(np.testing.assert_array_equal, dict(loaded), variables)
+        assert getattr(run.config.model, field) == getattr(config, field)
+    jax.tree.map(np.testing.assert_array_equal, dict(run.variables), variables)
     report = json.loads((tmp_path / "runs" / "a" / convert.REPORT_FILE).read_text())
     assert report["facts"]["global_step"] == 70 and len(report["mapped"]) == len(state_dict)
     assert report["ignored"]["preprocess.image_mean"] == "constants of the preprocessing"
@@ -79,7 +79,7 @@ def test_half_precision_of_the_old_format(tiny, tmp_path):
     halves = {key: value.astype(np.float16) for key, value in state_dict.items()}
     torch_writer.write_legacy(tmp_path / "a.pth", torch_writer.tensors(halves))
     run_convert(tmp_path / "a.pth", tmp_path / "run")
-    _, loaded = muvo_jax.load(tmp_path / "run")
+    loaded = muvo_jax.load(tmp_path / "run").variables
     expected = jax.tree.map(lambda leaf: leaf.astype(np.float16).astype(np.float32), variables)
     jax.tree.map(np.testing.assert_array_equal, dict(loaded), expected)
 
@@ -160,6 +160,6 @@ def test_a_checkpoint_of_full_size(tmp_path):
     run_convert(tmp_path / "full.ckpt", tmp_path / "run")
     print(f"{time.perf_counter() - start_s:.1f} s, "
           f"{resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2 ** 20:.2f} GiB at most")
-    _, variables = muvo_jax.load(tmp_path / "run")
+    variables = muvo_jax.load(tmp_path / "run").variables
     drawn = weights_rule.make_param("features_combine.weight", manifest["features_combine.weight"])
     np.testing.assert_array_equal(variables["params"]["fusion"]["combine"]["kernel"], drawn.T)

@@ -172,7 +172,7 @@ def test_imagined_steps_are_driven_by_the_action_before_them(monkeypatch, config
         config = dataclasses.replace(presets.tiny().model, heads=("image",))
 
         def decode(self, variables, features, heads):
-            return {"image": {1: features[..., :3].reshape(*features.shape[:-1], 1, 1, 3)}}
+            return types.Predictions({"image": {1: features[..., :3].reshape(*features.shape[:-1], 1, 1, 3)}})
 
     def observe(model, variables, key, batch, *, sampled):
         calls["observed"] = batch.frames

@@ -41,10 +41,10 @@ def test_a_converted_checkpoint_of_full_size_gives_the_authors_numbers(tmp_path)
     del state_dict
     convert.convert(convert.Options(tmp_path / "full.ckpt", tmp_path / "run"), screen.Screen())
     (tmp_path / "full.ckpt").unlink()
-    model, variables = muvo_jax.load(tmp_path / "run")
+    run = muvo_jax.load(tmp_path / "run")
     context = cases.Context(packs.Pack(FOLDER / "p4_full" / f"{name}.npz"), packs.Settings(FOLDER))
     checks = cases.PackChecks("converted", (rf"{name}\.npz",),
-                              (lambda context: full_models.model_checks(context, model.config, variables),))
+                              (lambda context: full_models.model_checks(context, run.config.model, run.variables),))
     report, lines = runner.Report(), []
     runner.run_pack(checks, context, report, lines.append)
     jax.clear_caches()

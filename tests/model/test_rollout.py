@@ -95,6 +95,35 @@ def test_imagine_equals_a_loop_by_hand(variables, state, actions):
         assert_close((dream.states[:, step], dream.prior[:, step]), (current, prior))
 
 
+def test_imagine_is_imagine_step_again_and_again(variables, state, actions):
+    keys = jax.random.split(jax.random.key(4), BATCH)
+    fold = jax.vmap(jax.random.fold_in, (0, None))
+    for options in ({}, {"temperature": 0.5}, {"sampled": False}):
+        dream = rollout.imagine(MODEL, variables, keys, state, actions, **options)
+        current = state
+        for step in range(HORIZON):
+            current = rollout.imagine_step(MODEL, variables, fold(fold(keys, step), 0), current, actions[:, step],
+                                           **options)
+        assert_close(dream.states[:, -1], current)
+
+
+def test_imagine_step_takes_any_leading_axes_and_compiles_once(variables, state, actions):
+    step = lambda key, state, action: rollout.imagine_step(MODEL, variables, key, state, action)
+    one = step(jax.random.key(1), state[0], actions[0, 0])
+    assert one.stochastic.shape == (CONFIG.stochastic_channels,)
+    before = rollout._imagine_one._cache_size()
+    for seed in (2, 3):
+        other = step(jax.random.key(seed), state[0], actions[0, 1])
+    assert rollout._imagine_one._cache_size() == before and not np.allclose(one.stochastic, other.stochastic)
+    keys = jax.random.split(jax.random.key(4), BATCH)
+    many = jax.vmap(step)(keys, state, actions[:, 0])
+    assert_close(many, step(jax.vmap(jax.random.fold_in, (0, None))(keys, 0), state, actions[:, 0]))
+    with pytest.raises(ValueError, match=r"imagine_step: got action \[2\], expected \[2, 2\]"):
+        step(jax.random.key(1), state, actions[0, 0])
+    with pytest.raises(ValueError, match="reach from 3 to 3"):
+        step(jax.random.key(1), state, jnp.full((BATCH, 2), 3.0))
+
+
 def test_branches_are_independent_futures(variables, state, actions):
     fan = jnp.stack([actions, -actions, actions], axis=1)
     dream = rollout.imagine(MODEL, variables, jax.random.key(1), state, fan, sampled=False)
@@ -116,14 +145,14 @@ def test_a_policy_drives_from_the_features(variables, state):
 def test_the_learned_policy_is_the_action_head(variables, state):
     dream = rollout.imagine(MODEL, variables, jax.random.key(2), state, rollout.learned_policy(MODEL, variables),
                             horizon=2)
-    np.testing.assert_allclose(dream.actions[:, 0], rollout.decode(MODEL, variables, state, ("action",))["action"][1],
+    np.testing.assert_allclose(dream.actions[:, 0], rollout.decode(MODEL, variables, state, ("action",)).action,
                                atol=1e-6)
 
 
 def test_gradients_reach_actions_and_the_start_state(variables, state, actions):
     def target(actions, state):
         dream = rollout.imagine(MODEL, variables, jax.random.key(3), state, actions)
-        return rollout.decode(MODEL, variables, dream.states[:, -1], ("action",))["action"][1].sum()
+        return rollout.decode(MODEL, variables, dream.states[:, -1], ("action",)).action.sum()
 
     by_action, by_state = jax.grad(target, argnums=(0, 1))(actions, state)
     # The action does not enter the recurrence, but its sample does: every step counts.
@@ -242,7 +271,7 @@ def test_forward_mode_reaches_decoded_images_with_plain_convolutions(variables, 
 
     def image(scale):
         dream = rollout.imagine(plain, variables, jax.random.key(0), state, scale * actions, sampled=False)
-        return rollout.decode(plain, variables, dream.states[:, -1], ("image",))["image"][4].sum()
+        return rollout.decode(plain, variables, dream.states[:, -1], ("image",)).at_scale(4).image.sum()
 
     _, tangent = jax.jit(lambda scale: jax.jvp(image, (scale,), (jnp.ones(()),)))(jnp.float32(0.5))
     np.testing.assert_allclose(tangent, jax.jit(jax.grad(image))(jnp.float32(0.5)), rtol=1e-3)

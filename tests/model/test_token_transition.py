@@ -167,7 +167,7 @@ def test_branches_and_policies_work_as_with_vectors(variables, state):
     assert not np.allclose(dream.features[:, 0], dream.features[:, 1])
     cloned = rollout.imagine(MODEL, variables, jax.random.key(2), state, rollout.learned_policy(MODEL, variables),
                              horizon=2)
-    decoded = rollout.decode(MODEL, variables, state, ("action",))["action"][1]
+    decoded = rollout.decode(MODEL, variables, state, ("action",)).action
     np.testing.assert_allclose(cloned.actions[:, 0], decoded, atol=1e-6)
     with pytest.raises(ValueError, match=r"got features \[3, 24\], expected \[..., 19, 24\] for the 2d latent"):
         MODEL.decode(variables, jnp.ones((3, 24)))
@@ -176,9 +176,9 @@ def test_branches_and_policies_work_as_with_vectors(variables, state):
 def test_every_head_at_its_full_size(variables, state):
     predictions = jax.eval_shape(lambda: MODEL.decode(variables, state.features))
     view = (CONFIG.range_view.rows, CONFIG.range_view.columns, 4)
-    assert predictions["range_view"][1].shape == (BATCH, *view)
-    assert predictions["image"][2].shape == (BATCH, *(side // 2 for side in CONFIG.image_size), 3)
-    assert predictions["occupancy"][4].shape == (BATCH, *(side // 4 for side in CONFIG.voxels.shape), 2)
+    assert predictions.range_view.shape == (BATCH, *view)
+    assert predictions.at_scale(2).image.shape == (BATCH, *(side // 2 for side in CONFIG.image_size), 3)
+    assert predictions.at_scale(4).occupancy.shape == (BATCH, *(side // 4 for side in CONFIG.voxels.shape), 2)
 
 
 def test_gradients_reach_actions_and_the_start_state(variables, state):

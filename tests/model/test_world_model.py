@@ -74,18 +74,18 @@ def test_every_head_at_every_scale(variables):
     full = {"image": CONFIG.image_size, "range_view": (CONFIG.range_view.rows, CONFIG.range_view.columns),
             "occupancy": CONFIG.voxels.shape, "action": ()}
     assert set(predictions) == set(CONFIG.heads)
-    for name, scales in predictions.items():
+    for name, scales in predictions.arrays.items():
         assert set(scales) == set(heads.TABLE[name].scales)
         for scale, value in scales.items():
             size = tuple(side // scale for side in full[name])
             assert value.shape == (2, 3, *size, heads.TABLE[name].channels) and value.dtype == jnp.float32
-    assert np.abs(predictions["action"][1]).max() <= 1
+    assert np.abs(predictions.action).max() <= 1
 
 
 def test_only_the_heads_asked_for_and_any_leading_axes(variables):
     feature = jnp.ones(MODEL.feature_shape)
     predictions = MODEL.decode(variables, feature, ("action",))
-    assert list(predictions) == ["action"] and predictions["action"][1].shape == (2,)
+    assert predictions.heads == ("action",) and predictions.action.shape == (2,)
     with pytest.raises(ValueError, match=r"no head depth; it has image"):
         MODEL.decode(variables, feature, ("depth",))
 
@@ -93,7 +93,7 @@ def test_only_the_heads_asked_for_and_any_leading_axes(variables):
 def test_range_view_comes_out_in_metres(variables):
     feature = jnp.ones((1, *MODEL.feature_shape))
     doubled = world_model.WorldModel(dataclasses.replace(CONFIG, range_scale_m=2 * CONFIG.range_scale_m))
-    range_view = lambda model: model.decode(variables, feature, ("range_view",))["range_view"][4]
+    range_view = lambda model: model.decode(variables, feature, ("range_view",)).at_scale(4).range_view
     np.testing.assert_allclose(range_view(doubled), 2 * range_view(MODEL), rtol=1e-5)
 
 

@@ -109,7 +109,8 @@ def test_image_terms_with_road_users_once_more_are_the_references():
     observed = types.Observed(types.LatentState(gaussian.mean, gaussian.mean), gaussian, gaussian)
     model = dataclasses.replace(MODEL, heads=("image",))
     loss = dataclasses.replace(LOSS, image=0.1, image_instance=0.05)
-    every = lambda batch: total.losses({"image": predictions}, batch, observed, model=model, loss=loss, keys=None)
+    predicted = types.Predictions({"image": predictions})
+    every = lambda batch: total.losses(predicted, batch, observed, model=model, loss=loss, keys=None)
     got, expected = jax.jit(every)(batch), 0.0
     for f in (1, 2, 4):
         rgb = (0.1 * got[f"image_{f}"] + 0.05 * got[f"image_instance_{f}"]) / f

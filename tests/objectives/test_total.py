@@ -28,14 +28,19 @@ def make_case(seed=0):
         action=2 * uniform(2) - 1, is_first=np.zeros(PREFIX, bool),
         image=generator.integers(0, 256, (*PREFIX, *MODEL.image_size, 3), np.uint8), range_view=range_view,
         occupancy=generator.choice(np.array([0, 1, 255], np.uint8), (*PREFIX, *MODEL.voxels.shape)))
-    predictions = {"image": {f: uniform(*(side // f for side in MODEL.image_size), 3) for f in (1, 2, 4)},
-                   "range_view": {f: 20 * uniform(rows // f, columns // f, 4) for f in (1, 2, 4)},
-                   "occupancy": {f: uniform(*(side // f for side in MODEL.voxels.shape), 2) for f in (1, 2, 4)},
-                   "action": {1: uniform(2)}}
+    predictions = types.Predictions({
+        "image": {f: uniform(*(side // f for side in MODEL.image_size), 3) for f in (1, 2, 4)},
+        "range_view": {f: 20 * uniform(rows // f, columns // f, 4) for f in (1, 2, 4)},
+        "occupancy": {f: uniform(*(side // f for side in MODEL.voxels.shape), 2) for f in (1, 2, 4)},
+        "action": {1: uniform(2)}})
     gaussian = lambda: types.Gaussian(uniform(8), 0.1 + uniform(8))
     state = types.LatentState(uniform(8), uniform(8))
     observed = types.Observed(state, gaussian(), gaussian())
     return *jax.tree.map(jnp.asarray, (predictions, batch, observed)), jax.random.split(jax.random.key(0), PREFIX[0])
+
+
+def only(predictions, head):
+    return types.Predictions({head: predictions.scales(head)})
 
 
 def losses(case, model=MODEL, loss=LOSS, axis_name=None):
@@ -61,14 +66,14 @@ def test_a_weight_of_zero_leaves_the_term_out():
 def test_heads_decide_which_terms_there_are():
     predictions, batch, observed, keys = make_case()
     model = dataclasses.replace(MODEL, heads=("image",))
-    terms = losses(({"image": predictions["image"]}, batch.replace(occupancy=None), observed, keys), model)
+    terms = losses((only(predictions, "image"), batch.replace(occupancy=None), observed, keys), model)
     assert set(terms) == {"image_1", "image_2", "image_4", "kl", "total"}
 
 
 def test_a_perfect_prediction_costs_nothing_where_it_is_scored():
     predictions, batch, observed, keys = make_case()
-    predictions["range_view"] = {f: batch.range_view[..., ::f, ::f, :] for f in (1, 2, 4)}
-    predictions["action"] = {1: batch.action}
+    predictions |= types.Predictions({"range_view": {f: batch.range_view[..., ::f, ::f, :] for f in (1, 2, 4)},
+                                      "action": {1: batch.action}})
     terms = losses((predictions, batch, observed.replace(prior=observed.posterior), keys))
     for name in ("range_xyz_1", "range_depth_2", "action"):
         assert terms[name] == 0.0
@@ -78,8 +83,8 @@ def test_a_perfect_prediction_costs_nothing_where_it_is_scored():
 def test_reference_numerics_pulls_the_points_of_holes():
     predictions, batch, observed, keys = make_case()
     hole = batch.range_view[..., 3:] < 0
-    predictions["range_view"] = {f: jnp.where(hole, 7.0, batch.range_view)[..., ::f, ::f, :] for f in (1, 2, 4)}
-    case = (predictions, batch, observed, keys)
+    filled = {f: jnp.where(hole, 7.0, batch.range_view)[..., ::f, ::f, :] for f in (1, 2, 4)}
+    case = (predictions | types.Predictions({"range_view": filled}), batch, observed, keys)
     assert losses(case)["range_xyz_1"] == 0.0
     assert losses(case, dataclasses.replace(MODEL, numerics="reference"))["range_xyz_1"] > 0.0
 
@@ -101,11 +106,12 @@ def test_the_loss_does_not_depend_on_how_devices_share_the_batch():
 def test_a_missing_prediction_target_or_scale_is_named():
     predictions, batch, observed, keys = make_case()
     with pytest.raises(ValueError, match="head 'image', the predictions have"):
-        losses(({"action": predictions["action"]}, batch, observed, keys))
+        losses((only(predictions, "action"), batch, observed, keys))
     with pytest.raises(ValueError, match="the batch has no occupancy"):
         losses((predictions, batch.replace(occupancy=None), observed, keys))
     with pytest.raises(ValueError, match=r"predicts scales \[1, 2\]"):
-        losses((predictions | {"image": {f: predictions["image"][f] for f in (1, 2)}}, batch, observed, keys))
+        losses((predictions | types.Predictions({"image": {f: predictions.scales("image")[f] for f in (1, 2)}}), batch,
+                observed, keys))
 
 
 def test_terms_and_weights_must_be_the_same_set():

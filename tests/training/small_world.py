@@ -94,7 +94,7 @@ class SmallWorld:
 
     def decode(self, variables, features, heads=None):
         names = self.config.heads if heads is None else heads
-        return SmallNetwork(self.config).apply(variables, features, names, method="decode")
+        return types.Predictions(SmallNetwork(self.config).apply(variables, features, names, method="decode"))
 
 
 def head_shapes(config):

@@ -151,9 +151,13 @@ def test_keeps_the_last_and_the_best(tmp_path, fresh, config):
 
 def test_load_gives_the_model_and_its_variables(tmp_path, fresh, config):
     _save(tmp_path, fresh, config, 1).close()
-    model, variables = checkpoint.load(tmp_path)
-    assert model == world_model.WorldModel(config.model)
-    jax.tree.map(np.testing.assert_array_equal, variables, _at(fresh, 1).variables)
+    run = muvo_jax.load(tmp_path)
+    assert isinstance(run, muvo_jax.Run) and run.model == world_model.WorldModel(config.model)
+    assert (run.config, run.contract, run.step, run.folder) == (config, config.contract, 1, tmp_path.resolve())
+    jax.tree.map(np.testing.assert_array_equal, run.variables, _at(fresh, 1).variables)
+    with pytest.warns(DeprecationWarning, match=r"write run = muvo_jax.load"):
+        model, variables = run
+    assert model is run.model and variables is run.variables
 
 
 def test_loading_what_is_not_there_says_what_was_expected(tmp_path):

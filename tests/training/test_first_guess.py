@@ -28,12 +28,12 @@ def test_a_fresh_model_predicts_the_training_mean(setting):
     features = np.random.default_rng(0).normal(size=(2, *model.feature_shape)).astype(np.float32)
     predicted = model.decode(variables, features, heads=("image", "range_view", "occupancy"))
     expected = mean.prediction()
-    np.testing.assert_allclose(predicted["image"][1][0], expected["image"], atol=0.5 / 255 + 1e-6)
-    np.testing.assert_allclose(predicted["range_view"][1][0][..., 3], expected["range_view"][..., 3], atol=1e-4)
-    logits = predicted["occupancy"][1][0]
+    np.testing.assert_allclose(predicted.image[0], expected["image"], atol=0.5 / 255 + 1e-6)
+    np.testing.assert_allclose(predicted.range_view[0][..., 3], expected["range_view"][..., 3], atol=1e-4)
+    logits = predicted.occupancy[0]
     share = 1 / (1 + np.exp(-(np.asarray(logits[..., 1]) - np.asarray(logits[..., 0]))))
     np.testing.assert_allclose(share, (mean.occupied + 1) / (mean.known + 4), atol=1e-5)
-    np.testing.assert_array_equal(predicted["occupancy"][2][0], logits[::2, ::2, ::2])
+    np.testing.assert_array_equal(predicted.at_scale(2).occupancy[0], logits[::2, ::2, ::2])
 
 
 def test_constants_fit_the_variables_of_the_model(setting):

@@ -132,7 +132,7 @@ def _deployed(model: world_model.WorldModel, variables: Any, embedding: jax.Arra
     dreamt, _ = jax.jit(model.imagine_step)(variables, zeros, action, seen)
     for place, state in (("deployment", last), ("deployment_forward/0", seen), ("deployment_forward/1", seen),
                          ("deployment_forward/2", dreamt)):
-        driven = rollout.decode(model, variables, state, ("action",))["action"][1][:, None]
+        driven = rollout.decode(model, variables, state, ("action",)).action[:, None]
         yield f"{place}/throttle_brake", driven[..., :1]
         yield f"{place}/steering", driven[..., 1:]
         yield f"{place}/hidden_state", state.deterministic
@@ -152,7 +152,7 @@ def _unrounded(entry: str, variables: Any, compute: Callable[[Any], dict[str, An
 def prediction_entries(prefix: str, predictions: Predictions,
                        config: config_lib.ModelConfig) -> Iterator[tuple[str, Any]]:
     """The heads' outputs [1, T, ...] by the reference's names, in its units and layout."""
-    for head, scales in predictions.items():
+    for head, scales in predictions.arrays.items():
         if head == "action":
             yield f"{prefix}/throttle_brake", scales[1][..., :1]
             yield f"{prefix}/steering", scales[1][..., 1:]

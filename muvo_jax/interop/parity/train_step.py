@@ -63,7 +63,7 @@ def _step(context: cases.Context) -> Checks:
         embedding, updated = model.encode(weights, batch, train=True)
         observed = rollout.filter_embeddings(model, weights, embedding, jnp.asarray(batch.action),
                                              jnp.asarray(batch.is_first), noise)
-        predictions: types.Predictions = {}
+        predictions = types.Predictions({})
         for head in config.heads:
             decode = jax.checkpoint(lambda weights, features, head=head: model.decode(weights, features, (head,)))
             predictions |= decode(weights, observed.states.features)
@@ -114,7 +114,7 @@ def _terms(terms: dict[str, jax.Array], predictions: types.Predictions, batch: t
             yield cases.Check(f"loss/{entry}", weights[name] * value, LOSS_TOLERANCE)
     for column, entry in enumerate(("throttle_brake", "steering")):
         pick = lambda action, column=column: jnp.asarray(action)[..., column:column + 1]
-        value = regression.l1_sums(pick(predictions["action"][1]), pick(batch.action)).value()
+        value = regression.l1_sums(pick(predictions.action), pick(batch.action)).value()
         yield cases.Check(f"loss/{entry}", loss.action * value, LOSS_TOLERANCE)
 
 

@@ -1,4 +1,4 @@
-"""Where imagined actions take the car: the kinematic bicycle of the action contract, or what a model predicts.
+"""Where actions take the car: the kinematic bicycle of the action contract, or what a recording or a model says.
 
 The same equations as the town's simulator: a period of dt seconds changes the speed to v' = max(0, v + pedal dt),
 drives the distance d = (v + v') dt / 2, turns by -d tan(steering * steer_full) / wheelbase (steering > 0 is right), and
@@ -8,25 +8,11 @@ car moved.
 
 from __future__ import annotations
 
-import flax.struct
 import jax
 import jax.numpy as jnp
 
 from muvo_jax import config as config_lib
-from muvo_jax.types import Array
-
-
-@flax.struct.dataclass
-class Motion:
-    """The car in the ego frame of the moment where imagination started (x forward, y left).
-
-    Attributes:
-      pose: float32 [..., 3], x (m), y (m), yaw (rad, counter-clockwise).
-      speed_mps: float32 [...].
-    """
-
-    pose: Array
-    speed_mps: Array
+from muvo_jax.types import Array, Motion
 
 
 def at_rest_of_frame(speed_mps: Array) -> Motion:
@@ -74,6 +60,29 @@ def moved(motion: Motion, ego_motion: Array) -> Motion:
     cosine, sine = jnp.cos(motion.pose[..., 2]), jnp.sin(motion.pose[..., 2])
     step = jnp.stack([cosine * forward_m - sine * left_m, sine * forward_m + cosine * left_m, turn_rad], axis=-1)
     return Motion(motion.pose + step, speed_mps)
+
+
+def relative(pose: Array, origin: Array) -> Array:
+    """`pose` [..., 3] as seen from `origin` [..., 3], both given in one frame."""
+    cosine, sine = jnp.cos(origin[..., 2]), jnp.sin(origin[..., 2])
+    x, y = pose[..., 0] - origin[..., 0], pose[..., 1] - origin[..., 1]
+    return jnp.stack([cosine * x + sine * y, cosine * y - sine * x, pose[..., 2] - origin[..., 2]], axis=-1)
+
+
+def into_frame(points_m: Array, pose: Array) -> Array:
+    """Points [..., P, 3] of one ego frame as seen from the ego frame that stands at `pose` [..., 3] in it (flat)."""
+    cosine, sine = (jnp.expand_dims(part(pose[..., 2]), -1) for part in (jnp.cos, jnp.sin))
+    x = points_m[..., 0] - jnp.expand_dims(pose[..., 0], -1)
+    y = points_m[..., 1] - jnp.expand_dims(pose[..., 1], -1)
+    return jnp.stack([cosine * x + sine * y, cosine * y - sine * x, points_m[..., 2]], axis=-1)
+
+
+def out_of_frame(points_m: Array, pose: Array) -> Array:
+    """The inverse of `into_frame`."""
+    cosine, sine = (jnp.expand_dims(part(pose[..., 2]), -1) for part in (jnp.cos, jnp.sin))
+    x, y = points_m[..., 0], points_m[..., 1]
+    return jnp.stack([cosine * x - sine * y + jnp.expand_dims(pose[..., 0], -1),
+                      sine * x + cosine * y + jnp.expand_dims(pose[..., 1], -1), points_m[..., 2]], axis=-1)
 
 
 def path(start: Motion, actions: Array, contract: config_lib.ActionContract, periods: int = 1) -> Motion:

@@ -17,14 +17,15 @@ import numpy as np
 
 from muvo_jax import config as config_lib
 from muvo_jax import types
-from muvo_jax.metrics import answers, baselines, maps, occupancy, tally
+from muvo_jax.metrics import answers, baselines, maps, occupancy, tally, warp
 from muvo_jax.model import rollout, world_model
 
 VERSION = "muvo_jax-2"
 PHASES = ("observed", "imagined")
 HEADS = tally.HEADS
 # What is judged, in the order of tables.
-SOURCES = ("model", "copy_last", "training_mean")
+SOURCES = ("model", "copy_last", "warp_last", "warp_fused", "training_mean")
+_MOTION = {"bicycle": "motion from actions", "none": "motion as recorded"}
 
 
 class Windows(NamedTuple):
@@ -49,7 +50,7 @@ def identity(config: config_lib.Config) -> str:
     latents = "sampled" if evaluation.sampled else "mean"
     return (f"{VERSION}: context {data.context}, horizon {data.horizon}, {frame_s:g} s a step, Chamfer on "
             f"{evaluation.chamfer_points or 'all'} points, return above {evaluation.return_threshold_m:g} m, {latents} "
-            f"latents, seed {evaluation.seed}")
+            f"latents, {_MOTION[config.contract.kinematics]}, seed {evaluation.seed}")
 
 
 def predict(model: world_model.WorldModel, variables: types.Variables, key: types.Array, batch: types.Batch, *,
@@ -151,7 +152,8 @@ class _Judge:
         context, count = self._config.data.context, len(item.drives)
         truth = item.batch[:count]
         steps = {"observed": (0, context), "imagined": (context, context + self._config.data.horizon)}
-        guesses = self._baselines(truth, count)
+        moved = self._moved(item.batch, count)
+        guesses = self._baselines(truth, count, moved)
         if predicted is not None:
             frames, other = ({name: value[:count] for name, value in (part or {}).items()} for part in predicted)
             for phase, (start, stop) in steps.items():
@@ -162,7 +164,7 @@ class _Judge:
                                   item.drives)
         for phase, (start, stop) in steps.items():
             part = truth.time_slice(start, stop)
-            movers = self._movers_of(part)
+            movers = self._movers_of(part, moved.get("warp_last", {}) if phase == "imagined" else {})
             for source, guess in guesses[phase].items():
                 threshold_m = self._config.evaluation.return_threshold_m if source == "model" else 0.0
                 self._tallies[phase].setdefault(source, tally.Tally(self._config)).add(
@@ -179,18 +181,35 @@ class _Judge:
                 "copy_last_unknown_voxels": self._unknown, "movers": self._movers, **scores,
                 "action_shuffle": self._answers.ratios()}
 
-    def _movers_of(self, truth: types.Batch) -> np.ndarray | None:
-        if truth.occupancy_moving_mask is None:
+    def _movers_of(self, truth: types.Batch, moved: baselines.Frames) -> np.ndarray | None:
+        """Which voxels count as movers': the recording's labels, else where the moved last frame is wrong."""
+        if truth.occupancy_moving_mask is not None:
+            self._movers = "road users on the move"
+            return np.asarray(truth.occupancy_moving_mask)
+        if truth.occupancy is None or "occupancy" not in moved:
             return None
-        self._movers = "road users on the move"
-        return np.asarray(truth.occupancy_moving_mask)
+        self._movers = "voxels that warp-last gets wrong"
+        return moved["occupancy"] != (np.asarray(truth.occupancy) == types.OCCUPANCY_OCCUPIED)
 
-    def _baselines(self, truth: types.Batch, count: int) -> dict[str, dict[str, baselines.Frames]]:
+    def _moved(self, batch: types.Batch, count: int) -> dict[str, baselines.Frames]:
+        """The moved frames of the real windows, as far as the motion is known and they are asked for."""
+        data, config = self._config.data, self._config
+        if warp.motion_source(batch, config) is None:
+            return {}
+        labelled = batch.occupancy is None or batch.occupancy_moving_mask is not None
+        wanted = [source for source in ("warp_last", "warp_fused")
+                  if source in self._sources or (source == "warp_last" and not labelled)]
+        return {source: {name: value[:count] for name, value in warp.warp(
+            batch, data.context, data.horizon, config, fused=source == "warp_fused").items()} for source in wanted}
+
+    def _baselines(self, truth: types.Batch, count: int,
+                   moved: Mapping[str, baselines.Frames]) -> dict[str, dict[str, baselines.Frames]]:
         """Phase -> source -> frames [B, steps, ...]."""
         data, guesses = self._config.data, {phase: {} for phase in PHASES}
         if "copy_last" in self._sources:
             guesses["imagined"]["copy_last"], unknown = baselines.copy_last(truth, data.context, data.horizon)
             self._unknown += unknown
+        guesses["imagined"] |= {source: frames for source, frames in moved.items() if source in self._sources}
         if "training_mean" in self._sources and self._mean:
             guesses["observed"]["training_mean"] = _repeat(self._mean, count, data.context)
             guesses["imagined"]["training_mean"] = _repeat(self._mean, count, data.horizon)

@@ -303,7 +303,8 @@ def draw_preview(folder: pathlib.Path, validator: validation.Validator, variable
     config = validator.config
     sheets.write_dream(folder, sheets.views_of_batch(batch, 0), {"world model": sheets.views_of_frames(frames, 0)},
                        np.asarray(batch.action[0]), sheets.Scene.of(config), context=config.data.context,
-                       title=f"{config.model.variant}  {name}  {split}", name=f"{name}_{split}", animate=False)
+                       title=f"{config.model.variant}  {name}  {split}", name=f"{name}_{split}", animate=False,
+                       beside=dream.moved_views(batch, config))
     draw_curves(folder.parent)
 
 

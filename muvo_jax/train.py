@@ -34,7 +34,7 @@ _ANY_CASE = ("lidar", "camera", "fusion", "latent", "backbone")  # the paper wri
 
 @dataclasses.dataclass(frozen=True)
 class Options:
-    """Trains a multimodal world model on camera and lidar, judges it beside two baselines and draws its dreams.
+    """Trains a multimodal world model on camera and lidar, judges it beside baselines and draws its dreams.
 
     Without options it records a small built-in town and learns to predict it, in minutes, on two CPU cores.
 

@@ -7,7 +7,7 @@ import pytest
 
 from muvo_jax import config as config_lib
 from muvo_jax import presets, types
-from muvo_jax.metrics import warp
+from muvo_jax.metrics import protocol, warp
 from muvo_jax.ops import camera, range_view
 
 CONTEXT, HORIZON = 2, 2
@@ -31,7 +31,7 @@ def driving(speed_mps=10.0):
     """
     frames, ahead = CONTEXT + HORIZON, types.OCCUPANCY_OCCUPIED
     occupancy = np.zeros((1, frames, *GRID.shape), np.uint8)
-    occupancy[0, 1, 14, 8] = ahead  # centre at 6.5 m
+    occupancy[0, (1, 2, 3), (14, 12, 10), 8] = ahead  # centre at 6.5 m, 4.5 m and 2.5 m
     occupancy[0, 0, 15, 12] = ahead  # at 7.5 m then, 5.5 m when seen from frame 1
     occupancy[0, 1, :, 12] = types.OCCUPANCY_UNKNOWN
     heights_m = np.linspace(0.0, 3.0, 16)
@@ -89,6 +89,23 @@ def test_without_kinematics_the_recorded_motion_counts():
     assert (warp.motion_source(batch, config_of()), warp.motion_source(batch, config)) == ("actions", "recorded")
     for name, value in warp.warp(batch, CONTEXT, HORIZON, config).items():
         np.testing.assert_allclose(value, warp.warp(batch, CONTEXT, HORIZON, config_of())[name], atol=1e-4)
+
+
+def test_the_protocol_judges_moved_frames_and_says_where_their_motion_comes_from():
+    """A car that overtakes: where geometry is wrong are the movers, since nothing labels them."""
+    batch = driving()
+    batch.occupancy[0, 3, 10, 8], batch.occupancy[0, 3, 13, 8] = 0, types.OCCUPANCY_OCCUPIED
+    report = protocol.evaluate(None, None, [protocol.Windows(batch, ("a",))], config_of(),
+                               sources=("copy_last", "warp_last", "warp_fused"))
+    assert list(report["imagined"]) == ["copy_last", "warp_last", "warp_fused"] and not report["observed"]
+    moved, copied = (report["imagined"][source] for source in ("warp_last", "copy_last"))
+    assert moved["iou_occ_above_observed"]["per_step"] == [1.0, 0.0] and copied["iou_occ_above_observed"]["mean"] == 0
+    assert moved["iou_occ_movers"]["mean"] == 0.0 and report["movers"] == "voxels that warp-last gets wrong"
+    assert "motion from actions" in report["protocol"]
+    assert "motion as recorded" in protocol.identity(config_of("none"))
+    lost = protocol.Windows(batch.replace(speed_mps=None, ego_motion=None), ("a",))
+    assert list(protocol.evaluate(None, None, [lost], config_of(), sources=("copy_last", "warp_last"))[
+        "imagined"]) == ["copy_last"]
 
 
 def test_what_cannot_be_moved_is_left_out_and_unknown_motion_is_refused():

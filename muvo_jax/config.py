@@ -330,7 +330,7 @@ class TrainConfig:
 
 @dataclasses.dataclass(frozen=True)
 class EvaluationConfig:
-    """The protocol of docs/design.md: metrics of observed and imagined frames beside two baselines.
+    """The protocol of docs/design.md: metrics of observed and imagined frames beside baselines.
 
     Attributes:
       windows: at most this many windows of a split, evenly spread; 0 means all.

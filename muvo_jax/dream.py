@@ -16,7 +16,7 @@ from muvo_jax import command_line, evaluate, types
 from muvo_jax import config as config_lib
 from muvo_jax.data import pipeline, schema, windows
 from muvo_jax.data import prepare as prepare_lib
-from muvo_jax.metrics import protocol
+from muvo_jax.metrics import protocol, warp
 from muvo_jax.model import rollout, world_model
 from muvo_jax.training import screen
 from muvo_jax.viz import sheets
@@ -34,7 +34,7 @@ class Options:
     run: Annotated[pathlib.Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
     """The run's folder."""
     checkpoint: str = "latest"
-    """latest, best (validation loss) or a step."""
+    """latest, best (skill of imagined frames, docs/design.md) or a step."""
     data: Annotated[str | None, command_line.shown("PATH", "the run's")] = None
     """Another recording than the one that the run was trained on."""
     split: Annotated[str | None, command_line.shown("NAME", "the first validation split")] = None
@@ -73,7 +73,7 @@ def dream(options: Options, show: screen.Screen) -> list[pathlib.Path]:
     recording = command_line.open_data(config, show)
     config = evaluate.fit(config, recording, tuple(chosen))
     window = choose_window(recording, config, options)
-    batch = pipeline.Frames(recording, config).batch([window])
+    batch = pipeline.Frames(recording, config).batch([window], judged=True)
     futures = dream_window(loaded.model, loaded.variables, jax.random.key(options.seed), batch,
                            context=config.data.context, horizon=config.data.horizon, branches=options.branches)
     labels = ["world model"] if options.branches == 1 else [f"future {index + 1}" for index in range(len(futures))]
@@ -83,7 +83,7 @@ def dream(options: Options, show: screen.Screen) -> list[pathlib.Path]:
     title = f"{config.model.variant} step {loaded.step}   {sequence.name} from frame {window.start}"
     written = sheets.write_dream(
         options.out or loaded.folder / "dreams", sheets.views_of_batch(batch, 0), views, np.asarray(batch.action[0]),
-        sheets.Scene.of(config), context=config.data.context, title=title,
+        sheets.Scene.of(config), context=config.data.context, title=title, beside=moved_views(batch, config),
         name=f"{sequence.split}_{sequence.name.rpartition('/')[2]}_{window.start:04d}")
     for path in written:
         show.line(f"wrote {path}")
@@ -114,6 +114,18 @@ def choose_window(recording: schema.Recording, config: config_lib.Config, option
         raise ValueError(f"--start {start}: sequence {sequence.name!r} has {sequence.length} frames; {frames} frames, "
                          f"{data.stride} apart, fit when they start between 0 and {last}.")
     return windows.Window(sequence, start, frames, data.stride)
+
+
+def moved_views(batch: types.Batch, config: config_lib.Config) -> dict[str, list[sheets.View]]:
+    """What geometry alone makes of the first window, to stand beside a dream: the observed frames, then the last one
+    moved. Nothing where the motion, or the ranges that an image is looked up through, are unknown."""
+    context, horizon, recorded = config.data.context, config.data.horizon, sheets.views_of_batch(batch, 0)
+    if warp.motion_source(batch, config) is None:
+        return {}
+    frames = warp.warp(batch[:1], context, horizon, config)
+    if any(getattr(batch, head) is not None and head not in frames for head in protocol.HEADS):
+        return {}
+    return {"warp-last": recorded[:context] + sheets.views_of_frames(frames, 0)}
 
 
 def dream_window(model: world_model.WorldModel, variables: types.Variables, key: types.Array, batch: types.Batch, *,

@@ -1,42 +1,26 @@
-"""python -m muvo_jax.evaluate RUN: judge a trained model beside copy-last and the training mean."""
+"""python -m muvo_jax.evaluate RUN: judge a trained model beside baselines that learned nothing."""
 
 from __future__ import annotations
 
 import dataclasses
-import json
-import math
 import pathlib
 import sys
-from collections.abc import Mapping
 from typing import Annotated, Any
 
 import jax
-import rich.table
 import tyro
 
-from muvo_jax import command_line
+from muvo_jax import command_line, evaluation_report
 from muvo_jax import config as config_lib
 from muvo_jax.data import pipeline, prepare
 from muvo_jax.metrics import protocol
 from muvo_jax.training import checkpoint_meta, screen, validation
 
-# metric -> (label, decimals, whether higher is better)
-METRICS = {
-    "psnr_db": ("PSNR (dB)", 2, True), "chamfer_m": ("Chamfer (m)", 3, False),
-    "iou_occ_observed": ("IoU+", 4, True), "iou_empty_observed": ("IoU-", 4, True),
-    "precision_observed": ("precision", 4, True), "recall_observed": ("recall", 4, True),
-    "iou_occ_all": ("IoU+, unknown = empty", 4, True), "iou_empty_all": ("IoU-, unknown = empty", 4, True),
-    "precision_all": ("precision, unknown = empty", 4, True), "recall_all": ("recall, unknown = empty", 4, True),
-    "depth_error_m": ("depth error (m)", 2, False), "semantic_image_share": ("semantic image, share right", 4, True),
-    "semantic_range_view_share": ("semantic range view, share right", 4, True),
-    "birds_eye_share": ("bird's-eye view, share right", 4, True),
-}
-SOURCES = {"model": "model", "copy_last": "copy-last", "training_mean": "training mean"}
-
 
 @dataclasses.dataclass(frozen=True)
 class Options:
-    """Judges a run on every split: frames that it observed and frames that it imagined, beside two baselines.
+    """Judges a run on every split: frames that it observed and frames that it imagined, beside baselines that learned
+    nothing, and whether what it imagines answers to the actions.
 
     Prints tables and writes RUN/evaluation.json and RUN/report.md (with the name of the recording where it is another
     one than the run's).
@@ -45,7 +29,7 @@ class Options:
     run: Annotated[pathlib.Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
     """The run's folder."""
     checkpoint: str = "latest"
-    """latest, best (validation loss) or a step."""
+    """latest, best (skill of imagined frames, docs/design.md) or a step."""
     splits: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME ...", help_behavior_hint="(default: all)")] = ()
     """Which ones to judge."""
     data: Annotated[str | None, command_line.shown("PATH", "the run's")] = None
@@ -95,9 +79,10 @@ def evaluate(options: Options, show: screen.Screen) -> dict[str, Any]:
                                    validation.windows(frames, split, config.evaluation.windows), config, mean)
         report["splits"][split] = scores
         for phase in protocol.PHASES:
-            show.console.print(screen_table(split, phase, scores))
+            show.console.print(evaluation_report.screen_table(split, phase, scores))
+        show.line(evaluation_report.answers_line(scores["action_shuffle"]))
     suffix = f"-{recording.description.name}" if options.data else ""
-    for path in write_report(loaded.folder, report, suffix):
+    for path in evaluation_report.write_report(loaded.folder, report, suffix):
         show.line(f"wrote {path}")
     return report
 
@@ -112,108 +97,6 @@ def fit(config: config_lib.Config, recording, chosen: tuple[str, ...]) -> config
     where = f"recording {recording.description.name!r} asks for another model than this run, which"
     checkpoint_meta.check_architecture(fitted, config, where)
     return fitted
-
-
-def screen_table(split: str, phase: str, scores: Mapping[str, Any]) -> rich.table.Table:
-    """One split and phase: a row for each metric, the best source bold."""
-    phase_scores = scores[phase]
-    table = rich.table.Table(title=f"{split}: {phase} frames, {scores['windows']} windows", title_justify="left")
-    table.add_column("metric")
-    for source in phase_scores:
-        table.add_column(SOURCES[source], justify="right")
-    if phase == "imagined":
-        steps = max(len(metric["per_step"]) for metric in phase_scores["model"].values())
-        for source in phase_scores:
-            table.add_column(f"{SOURCES[source]}\nat step {steps}", justify="right")
-    table.add_column("undefined\nframes", justify="right")
-    for name, (label, decimals, higher) in METRICS.items():
-        if name not in phase_scores["model"]:
-            continue
-        means = {source: metrics[name]["mean"] for source, metrics in phase_scores.items() if name in metrics}
-        cells = marked(means, phase_scores, decimals, higher, "[bold]{}[/bold]")
-        if phase == "imagined":
-            last = {source: metrics[name]["per_step"][-1]
-                    for source, metrics in phase_scores.items() if name in metrics}
-            cells += marked(last, phase_scores, decimals, higher, "[bold]{}[/bold]")
-        undefined = [str(metrics[name].get("undefined", "")) for metrics in phase_scores.values() if name in metrics]
-        table.add_row(label, *cells, " / ".join(part for part in undefined if part))
-    return table
-
-
-def marked(values: Mapping[str, float], sources: Mapping[str, Any], decimals: int, higher: bool,
-           mark: str) -> list[str]:
-    """The values as text, the best one marked; NaN stays nan, a source without the metric is empty."""
-    defined = [value for value in values.values() if not math.isnan(value)]
-    best = (max if higher else min)(defined) if defined else None
-    cells = []
-    for source in sources:
-        text = "" if source not in values else number(values[source], decimals)
-        cells.append(mark.format(text) if text and values[source] == best else text)
-    return cells
-
-
-def number(value: float, decimals: int) -> str:
-    return "nan" if math.isnan(value) else f"{value:.{decimals}f}"
-
-
-def write_report(folder: pathlib.Path, report: Mapping[str, Any], suffix: str = "") -> tuple[pathlib.Path, ...]:
-    """Writes RUN/evaluation.json (not-a-number as the string "nan") and RUN/report.md; returns their paths."""
-    numbers, page = folder / f"evaluation{suffix}.json", folder / f"report{suffix}.md"
-    numbers.write_text(json.dumps(json_ready(report), indent=1) + "\n", encoding="utf-8")
-    page.write_text(markdown(report), encoding="utf-8")
-    return numbers, page
-
-
-def json_ready(value):
-    """Strict JSON: floats that are not finite become strings."""
-    if isinstance(value, Mapping):
-        return {name: json_ready(item) for name, item in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [json_ready(item) for item in value]
-    return str(value) if isinstance(value, float) and not math.isfinite(value) else value
-
-
-def markdown(report: Mapping[str, Any]) -> str:
-    """The report as a page: for each split the averages and every step of the horizon."""
-    lines = [f"# {pathlib.Path(report['run']).name}", "",
-             f"{report['variant']}, {report['parameters']:,} parameters, step {report['step']}, trained and judged on "
-             f"{report['data']['name']}.", "", f"Protocol: {report['protocol']}. Training mean of "
-             f"{report['training_mean_frames']} frames. Bold is best. Chamfer and PSNR are means over frames; voxel "
-             f"scores come from counts over the whole split.", ""]
-    for split, scores in report["splits"].items():
-        lines += [f"## {split} ({scores['windows']} windows)", ""]
-        for phase in protocol.PHASES:
-            lines += [f"### {phase} frames", "", *_average_table(scores[phase]), ""]
-        lines += ["### imagined frames, step by step", "", *_step_table(scores["imagined"]), "",
-                  f"Copy-last copied {scores['copy_last_unknown_voxels']} unknown voxels as empty.", ""]
-    return "\n".join(lines)
-
-
-def _average_table(phase_scores: Mapping[str, Any]) -> list[str]:
-    lines = ["| metric | " + " | ".join(SOURCES[source] for source in phase_scores) + " | frames (undefined) |",
-             "|---|" + "---:|" * (len(phase_scores) + 1)]
-    for name, (label, decimals, higher) in METRICS.items():
-        if name not in phase_scores["model"]:
-            continue
-        means = {source: metrics[name]["mean"] for source, metrics in phase_scores.items() if name in metrics}
-        counted = [f"{metrics[name]['frames']} ({metrics[name]['undefined']})" for metrics in phase_scores.values()
-                   if "frames" in metrics.get(name, {})]
-        cells = marked(means, phase_scores, decimals, higher, "**{}**")
-        lines.append(f"| {label} | " + " | ".join(cells) + f" | {', '.join(counted)} |")
-    return lines
-
-
-def _step_table(phase_scores: Mapping[str, Any]) -> list[str]:
-    steps = len(next(iter(phase_scores["model"].values()))["per_step"])
-    lines = ["| metric | source | " + " | ".join(str(step + 1) for step in range(steps)) + " |",
-             "|---|---|" + "---:|" * steps]
-    for name in ("psnr_db", "chamfer_m", "iou_occ_observed", "iou_occ_all"):
-        for source, metrics in phase_scores.items():
-            if name in metrics:
-                label, decimals, _ = METRICS[name]
-                cells = " | ".join(number(value, decimals) for value in metrics[name]["per_step"])
-                lines.append(f"| {label} | {SOURCES[source]} | {cells} |")
-    return lines
 
 
 def main() -> int:

@@ -47,7 +47,7 @@ class Options:
     out: Annotated[pathlib.Path, tyro.conf.Positional, tyro.conf.arg(metavar="OUT")]
     """A new or empty folder."""
     checkpoint: str = "latest"
-    """latest, best (validation loss) or a step."""
+    """latest, best (skill of imagined frames, docs/design.md) or a step."""
     horizon: Annotated[int | None, command_line.shown("N", "the run's")] = None
     """Steps that `imagine` imagines."""
 

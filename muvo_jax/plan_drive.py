@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import json
 import pathlib
 import sys
 import time
+from collections.abc import Sequence
 from typing import Annotated, Any, Literal
 
 import jax
@@ -14,13 +16,13 @@ import numpy as np
 import rich.table
 import tyro
 
-from muvo_jax import command_line, evaluate
+from muvo_jax import command_line, evaluation_report, types
 from muvo_jax import config as config_lib
 from muvo_jax import run as run_lib
 from muvo_jax.agents import closed_loop, environment, planners, rewards, sensitivity
 from muvo_jax.data import prepare
 from muvo_jax.data.town import record, settings, simulator
-from muvo_jax.metrics import protocol
+from muvo_jax.metrics import protocol, warp
 from muvo_jax.model import rollout
 from muvo_jax.training import checkpoint_meta, screen
 from muvo_jax.viz import canvas, sheets
@@ -45,7 +47,7 @@ class Options:
     run: Annotated[pathlib.Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
     """The run's folder."""
     checkpoint: str = "latest"
-    """latest, best (validation loss) or a step."""
+    """latest, best (skill of imagined frames, docs/design.md) or a step."""
     episodes: int = 5
     """Drives of each driver, each with a seed of its own."""
     seconds: float = 20.0
@@ -98,7 +100,8 @@ def plan_drive(options: Options, show: screen.Screen) -> dict[str, Any]:
         show.line(f"{name}: {len(seeds)} drives, {time.perf_counter() - began_s:.0f} s so far", style="dim")
     scores = closed_loop.summarise(drives, EXPERT, town.config.route_m)
     answers = sensitivity.measure(world, lambda state: town_truth(town, state), loaded.model, loaded.variables,
-                                  jax.random.key(options.seed), seeds, horizon=options.horizon, context=context)
+                                  jax.random.key(options.seed), seeds, horizons=contrast_horizons(config),
+                                  context=context, moved=functools.partial(moved_views, town, config))
     show.line(f"sensitivity to actions, {time.perf_counter() - began_s:.0f} s so far", style="dim")
     report = {"run": str(loaded.folder), "step": loaded.step, "planner": options.planner, "horizon": options.horizon,
               "plans": options.plans, "iterations": options.iterations, "occupancy_scale": options.occupancy_scale,
@@ -113,7 +116,7 @@ def plan_drive(options: Options, show: screen.Screen) -> dict[str, Any]:
     folder = options.out or loaded.folder / "plan_drive"
     folder.mkdir(parents=True, exist_ok=True)
     numbers, page = folder / "plan_drive.json", folder / "plan_drive.md"
-    numbers.write_text(json.dumps(evaluate.json_ready(report), indent=1) + "\n", encoding="utf-8")
+    numbers.write_text(json.dumps(evaluation_report.json_ready(report), indent=1) + "\n", encoding="utf-8")
     page.write_text(markdown(report), encoding="utf-8")
     pictures = film(loaded, town, drives[PLANNED][0], options)
     for path in (numbers, page, canvas.save_gif(folder / "plan_drive.gif", pictures, world.step_s)):
@@ -175,6 +178,31 @@ def town_truth(town: simulator.Town, state: simulator.TownState) -> dict[str, np
             "ego_motion": np.array([0.0, 0.0, 0.0, seen["speed_mps"]], np.float32)}
 
 
+def contrast_horizons(config: config_lib.Config) -> tuple[int, int]:
+    """As many steps as training imagines (where it imagines none, as evaluation does), and twice as many."""
+    data, observed = config.data, config.train.observe_frames
+    steps = data.frames - observed if 0 < observed < data.frames else data.horizon
+    return steps, 2 * steps
+
+
+def moved_views(town: simulator.Town, config: config_lib.Config, states: Sequence[simulator.TownState],
+                action: Sequence[float], steps: int) -> dict[str, np.ndarray]:
+    """What geometry alone says of the sensors under an action, from each state on: see sensitivity.measure.
+
+    A pixel of the range view to which no return was moved keeps its range: it answers to no action.
+    """
+    count, truths = len(states), [town_truth(town, state) for state in states]
+    now = lambda head: np.stack([truth[head] for truth in truths])[:, None]
+    calibration = {name: np.stack([getattr(town.renderer, name)] * count) for name in ("intrinsics", "camera_to_ego")}
+    held = np.broadcast_to(np.float32(action), (count, 1 + steps, 2))
+    batch = types.Batch(action=held, is_first=np.zeros(held.shape[:2], bool), speed_mps=now("ego_motion")[..., 3],
+                        **{head: now(head) for head in protocol.HEADS}, **calibration)
+    frames = warp.warp(batch, 1, steps, config)
+    range_m = frames["range_view"][..., 3]
+    return {"image": frames["image"], "range_view": np.where(range_m > 0.0, range_m, now("range_view")[..., 3]),
+            "occupancy": frames["occupancy"].astype(np.float32)}
+
+
 def film(loaded: run_lib.Run, town: simulator.Town, drive: closed_loop.Drive,
          options: Options) -> list[np.ndarray]:
     """Frames of a planned drive: the town, what the model makes of it, what it expects at the end of its plan."""
@@ -225,9 +253,12 @@ def screen_table(scores, options: Options) -> rich.table.Table:
 
 def sensitivity_rows(answers) -> list[str]:
     """The sensitivity to actions as a Markdown table."""
-    return ["| response to | of | gain (1 is right, 0 ignores actions) | correlation |", "|---|---|---:|---:|",
-            *(f"| {contrast} | {head} | {score['gain']:.2f} | {score['correlation']:.2f} |"
-              for contrast, scores in answers.items() for head, score in scores.items())]
+    return ["| response to | steps | of | source | gain (1 is right, 0 ignores actions) | correlation |",
+            "|---|---:|---|---|---:|---:|",
+            *(f"| {contrast} | {steps} | {head} | {evaluation_report.SOURCES[source]} | {score['gain']:.2f} | "
+              f"{score['correlation']:.2f} |" for steps, contrasts in answers.items()
+              for contrast, heads in contrasts.items() for head, sources in heads.items()
+              for source, score in sources.items())]
 
 
 def markdown(report) -> str:
@@ -242,7 +273,8 @@ def markdown(report) -> str:
     lines += ["", f"Success: driven to the end of the time without a collision and without leaving the route. Metres "
                   f"count along the route until then; its whole length is {report['route_m']:g} m.", "",
               "Does imagination answer to actions? From each takeover on, the same noise under two plans: the "
-              "difference that the model predicts between them, regressed on the town's.", "",
+              "difference that the model predicts between them, regressed on the town's. Warp-last moves what was last "
+              "seen by what the plan does to the car, and has learned nothing.", "",
               *sensitivity_rows(report["sensitivity"]), ""]
     return "\n".join(lines)
 

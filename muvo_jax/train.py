@@ -34,7 +34,7 @@ _ANY_CASE = ("lidar", "camera", "fusion", "latent", "backbone")  # the paper wri
 
 @dataclasses.dataclass(frozen=True)
 class Options:
-    """Trains a multimodal world model on camera and lidar, judges it beside two baselines and draws its dreams.
+    """Trains a multimodal world model on camera and lidar, judges it beside baselines and draws its dreams.
 
     Without options it records a small built-in town and learns to predict it, in minutes, on two CPU cores.
 
@@ -303,14 +303,16 @@ def draw_preview(folder: pathlib.Path, validator: validation.Validator, variable
     config = validator.config
     sheets.write_dream(folder, sheets.views_of_batch(batch, 0), {"world model": sheets.views_of_frames(frames, 0)},
                        np.asarray(batch.action[0]), sheets.Scene.of(config), context=config.data.context,
-                       title=f"{config.model.variant}  {name}  {split}", name=f"{name}_{split}", animate=False)
+                       title=f"{config.model.variant}  {name}  {split}", name=f"{name}_{split}", animate=False,
+                       beside=dream.moved_views(batch, config))
     draw_curves(folder.parent)
 
 
 def draw_curves(folder: pathlib.Path) -> None:
     """RUN/curves.png from RUN/metrics.jsonl."""
     records = run_folder.read_metrics(folder)
-    names = ("total", "psnr_db", "kl", "gradient_norm", "imagined_psnr_db", "imagined_chamfer_m", "imagined_iou_occ")
+    names = ("total", "psnr_db", "kl", "gradient_norm", "imagined_psnr_db", "imagined_chamfer_m",
+             "imagined_iou_occ_above", "skill")
     units = {"psnr_db": "dB", "imagined_psnr_db": "dB", "imagined_chamfer_m": "m"}
     plots = []
     for name in names:

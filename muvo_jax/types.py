@@ -57,6 +57,8 @@ class Batch(_Indexable):
       depth_m: float32 [B, T, H, W], along the optical axis of `image`; -1 where nothing is near enough to be measured.
       image_classes: uint8 [B, T, H, W], what each pixel shows; 255 unlabelled.
       image_instance_mask: bool [B, T, H, W], whether the pixel shows a vehicle or pedestrian.
+      image_moving_mask: bool [B, T, H, W] and occupancy_moving_mask: bool [B, T, X, Y, Z], where road users on the move
+        are; only scores read them.
       range_view_classes: uint8 [B, T, Hr, Wr], what each pixel of `range_view` hit; 255 where nothing returned.
       birds_eye_classes: uint8 [B, T, X, Y], what lies on each cell of the ground plan of `occupancy`; 255 unknown.
       birds_eye_instances: int32 [B, T, X, Y], the vehicle or pedestrian there, numbered from 1 in each frame; 0 none.
@@ -78,6 +80,8 @@ class Batch(_Indexable):
     depth_m: ArrayLike | None = None
     image_classes: ArrayLike | None = None
     image_instance_mask: ArrayLike | None = None
+    image_moving_mask: ArrayLike | None = None
+    occupancy_moving_mask: ArrayLike | None = None
     range_view_classes: ArrayLike | None = None
     birds_eye_classes: ArrayLike | None = None
     birds_eye_instances: ArrayLike | None = None
@@ -138,7 +142,8 @@ BATCH_FIELDS = {  # dtype, rank
     "target_m": (np.float32, 3), "next_target_m": (np.float32, 3), "occupancy": (np.uint8, 5),
     "route_map": (np.uint8, 4), "speed_mps": (np.float32, 2), "reward": (np.float32, 2),
     "depth_m": (np.float32, 4), "image_classes": (np.uint8, 4), "range_view_classes": (np.uint8, 4),
-    "image_instance_mask": (np.bool_, 4), "birds_eye_classes": (np.uint8, 4), "birds_eye_instances": (np.int32, 4),
+    "image_instance_mask": (np.bool_, 4), "image_moving_mask": (np.bool_, 4), "occupancy_moving_mask": (np.bool_, 5),
+    "birds_eye_classes": (np.uint8, 4), "birds_eye_instances": (np.int32, 4),
     "is_terminal": (np.bool_, 2), "ego_motion": (np.float32, 3), "intrinsics": (np.float32, 3),
     "camera_to_ego": (np.float32, 3),
 }

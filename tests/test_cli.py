@@ -14,7 +14,7 @@ import pytest
 
 import muvo_jax
 from muvo_jax import __main__ as listing
-from muvo_jax import command_line, evaluate, presets, train
+from muvo_jax import command_line, evaluate, evaluation_report, presets, train
 from muvo_jax import config as config_lib
 from muvo_jax.training import host, run_folder, screen
 
@@ -188,8 +188,10 @@ def test_evaluating_what_is_not_a_run_is_one_clear_line(capsys, tmp_path):
 
 
 def _scores(value):
-    metric = {"mean": value, "per_step": [value, 2 * value], "frames": 4, "undefined": 1}
-    return {"psnr_db": metric, "chamfer_m": {**metric, "mean": float("nan")}}
+    metric = {"mean": value, "interval": [0.5 * value, 2 * value], "per_step": [value, 2 * value], "frames": 4,
+              "undefined": 1}
+    undefined = {"mean": float("nan"), "interval": [float("nan")] * 2}
+    return {"psnr_db": metric, "chamfer_m": {**metric, **undefined}}
 
 
 def test_report_marks_the_best_and_says_nan(tmp_path):
@@ -197,16 +199,20 @@ def test_report_marks_the_best_and_says_nan(tmp_path):
               "imagined": {"model": _scores(1.0), "copy_last": _scores(3.0), "training_mean": _scores(2.0)}}
     report = {"run": "runs/x", "variant": "RV-WOB-TR", "step": 3, "parameters": 1000, "data": {"name": "town"},
               "protocol": "p", "training_mean_frames": 9,
-              "splits": {"val_rl": {"windows": 2, "copy_last_unknown_voxels": 5, **phases}}}
-    evaluate.write_report(tmp_path, report)
+              "splits": {"val_rl": {"windows": 2, "drives": 2, "copy_last_unknown_voxels": 5, "movers": None,
+                                    "action_shuffle": {"image": {"mean": 1.25, "interval": [float("nan")] * 2,
+                                                                 "per_step": [1.0, 1.5]}}, **phases}}}
+    evaluation_report.write_report(tmp_path, report)
     page = (tmp_path / "report.md").read_text()
-    assert "| PSNR (dB) | **2.00** | 1.00 | 4 (1), 4 (1) |" in page
-    assert "| PSNR (dB) | 1.00 | **3.00** | 2.00 |" in page
+    assert "| PSNR (dB) | **2.00** [1.00..4.00] | 1.00 [0.50..2.00] | 4 (1), 4 (1) |" in page
+    assert "| PSNR (dB) | 1.00 [0.50..2.00] | **3.00** [1.50..6.00] | 2.00 [1.00..4.00] |" in page
     assert "| Chamfer (m) | nan | nan | nan |" in page
+    assert "| image | 1.25 | 1.00 | 1.50 |" in page
     assert "| PSNR (dB) | copy-last | 3.00 | 6.00 |" in page
     stored = json.loads((tmp_path / "evaluation.json").read_text())
     assert stored["splits"]["val_rl"]["imagined"]["model"]["chamfer_m"]["mean"] == "nan"
-    table = evaluate.screen_table("val_rl", "imagined", report["splits"]["val_rl"])
+    assert stored["splits"]["val_rl"]["imagined"]["model"]["psnr_db"]["interval"] == [0.5, 2.0]
+    table = evaluation_report.screen_table("val_rl", "imagined", report["splits"]["val_rl"])
     assert table.row_count == 2
 
 

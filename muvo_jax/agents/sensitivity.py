@@ -20,13 +20,15 @@ from muvo_jax.model.world_model import WorldModel
 from muvo_jax.types import OCCUPANCY_OCCUPIED, OCCUPANCY_UNKNOWN, Array, ArrayLike, LatentState, Variables
 
 HEADS = ("image", "range_view", "occupancy", "ego_motion")
+Moved = Callable[[Sequence[Any], Sequence[float], int], Mapping[str, np.ndarray]]
+Answers = dict[int, dict[str, dict[str, dict[str, dict[str, float]]]]]
 # Name -> two actions, each held for the whole horizon.
 CONTRASTS = {"brake or accelerate": ((-0.5, 0.0), (0.5, 0.0)), "left or right": ((0.0, -0.15), (0.0, 0.15))}
 
 
 def measure(simulator: closed_loop.Simulator, truth: Callable[[Any], Mapping[str, ArrayLike]], model: WorldModel,
-            variables: Variables, key: Array, seeds: Sequence[int], *, horizon: int,
-            context: int) -> dict[str, dict[str, dict[str, float]]]:
+            variables: Variables, key: Array, seeds: Sequence[int], *, horizons: Sequence[int], context: int,
+            moved: Moved | None = None) -> Answers:
     """Scores of every contrast and head over drives of the given seeds.
 
     Args:
@@ -35,22 +37,28 @@ def measure(simulator: closed_loop.Simulator, truth: Callable[[Any], Mapping[str
       model, variables: heads of HEADS that it lacks are left out.
       key: of the latents' noise; both plans share it.
       seeds: of the simulator.
-      horizon: steps under either plan.
+      horizons: steps under either plan, each scored on its own.
+      context: steps that the expert drives.
+      moved: what geometry alone predicts, to be scored beside the model: (states, action, steps) -> head -> values
+        [states, steps, ...] as `values` has them.
 
     Returns:
-      contrast -> head -> {"gain", "correlation"}, over all steps of all drives; see uncertainty.action_sensitivity.
+      horizon -> contrast -> head -> source ("model", "warp_last") -> {"gain", "correlation"}, over all steps up to the
+      horizon and all drives; see uncertainty.action_sensitivity.
 
     Raises:
-      ValueError: if there is no seed or a horizon below 1.
+      ValueError: if there is no seed, no horizon or one below 1.
     """
-    if not seeds or horizon < 1:
-        raise ValueError(f"sensitivity: got {len(seeds)} seeds and horizon {horizon}; expected at least 1 of each.")
+    if not seeds or not horizons or min(horizons) < 1:
+        raise ValueError(f"sensitivity: got {len(seeds)} seeds and horizons {list(horizons)}; expected at least 1 of "
+                         f"each, of at least 1 step.")
+    horizon = max(horizons)
     heads = tuple(head for head in HEADS if head in model.config.heads)
     key_watch, key_imagine = jax.random.split(key)
     started = [watch(simulator, model, variables, jax.random.fold_in(key_watch, seed), seed, context) for seed in seeds]
     states = [state for state, _ in started]
     latents = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *(latent for _, latent in started))
-    scores: dict[str, dict[str, dict[str, float]]] = {}
+    scores: Answers = {steps: {} for steps in horizons}
     for name, pair in CONTRASTS.items():
         plans = np.broadcast_to(np.asarray(pair, np.float32)[None, :, None], (len(seeds), 2, horizon, 2))
         dream = rollout.imagine(model, variables, key_imagine, latents, plans, same_noise=True)
@@ -58,9 +66,17 @@ def measure(simulator: closed_loop.Simulator, truth: Callable[[Any], Mapping[str
         decoded = [[jax.device_get(rollout.decode(model, variables, dream.states[drive, plan], heads))
                     for drive in range(len(seeds))] for plan in (0, 1)]
         shown = [[follow(simulator, truth, state, action, horizon) for state in states] for action in pair]
-        scores[name] = {
-            head: score(head, [np.stack([predictions[head] for predictions in drives]) for drives in decoded],
-                        [np.stack([frames[head] for frames in drives]) for drives in shown]) for head in heads}
+        beside = [moved(states, action, horizon) if moved else {} for action in pair]
+        for head in heads:
+            true = [np.stack([frames[head] for frames in drives]) for drives in shown]
+            sources = {"model": [values(head, np.stack([predictions[head] for predictions in drives]))
+                                 for drives in decoded]}
+            if head in beside[0]:
+                sources["warp_last"] = [frames[head] for frames in beside]
+            for steps in horizons:
+                cut = lambda pair, steps=steps: [value[:, :steps] for value in pair]
+                scores[steps].setdefault(name, {})[head] = {
+                    source: score(head, cut(predicted), cut(true)) for source, predicted in sources.items()}
     return scores
 
 
@@ -93,10 +109,10 @@ def score(head: str, predicted: Sequence[ArrayLike], shown: Sequence[ArrayLike])
     Args:
       head: one of HEADS; images answer in [0, 1], range views in metres of range where both plans return, occupancy in
         probability where both plans know, ego_motion in m/s of speed.
-      predicted: decoded under either plan, [..., *size, channels].
+      predicted: `values` of what was predicted under either plan.
       shown: types.Batch's field under either plan, [..., *size, channels] ([..., X, Y, Z] of occupancy).
     """
-    first, second = (_value(head, np.asarray(value)) for value in predicted)
+    first, second = (np.asarray(value) for value in predicted)
     true, known = zip(*(_truth(head, np.asarray(value)) for value in shown), strict=True)
     both = known[0] & known[1]
     mask = lambda value: jnp.asarray(np.where(both, value, 0.0), jnp.float32)
@@ -104,7 +120,8 @@ def score(head: str, predicted: Sequence[ArrayLike], shown: Sequence[ArrayLike])
     return {name: float(value) for name, value in found.items()}
 
 
-def _value(head: str, decoded: np.ndarray) -> np.ndarray:
+def values(head: str, decoded: np.ndarray) -> np.ndarray:
+    """What answers to actions of a decoded head [..., *size, channels]: see `score`."""
     if head in ("range_view", "ego_motion"):
         return decoded[..., 3]
     if head == "occupancy":

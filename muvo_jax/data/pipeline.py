@@ -44,16 +44,20 @@ class Frames:
         """Frame `index` of `sequence`; called from several threads at once."""
         return self.cache.get((sequence.name, sequence.start + index), functools.partial(self._make, sequence, index))
 
-    def batch(self, windows: Sequence[windows_lib.Window]) -> types.Batch:
+    def batch(self, windows: Sequence[windows_lib.Window], *, judged: bool = False) -> types.Batch:
         """The windows, all of one length, as one Batch of NumPy arrays.
+
+        Args:
+          judged: with the fields that scores and baselines alone read (prepare.judged_only).
 
         Raises:
           DataError: for a damaged file, naming it.
         """
         rows = [[self.get(window.sequence, index) for index in window.indices] for window in windows]
+        left_out = {*_HOST_ONLY, *(() if judged else prepare.judged_only(self.config))}
         fields: dict[str, np.ndarray] = {}
         for name, example in rows[0][0].items():
-            if name in _HOST_ONLY:
+            if name in left_out:
                 continue
             if name in _UNTIMED:
                 fields[name] = np.stack([row[0][name] for row in rows])
@@ -68,6 +72,11 @@ class Frames:
         is_first = np.zeros(fields["action"].shape[:2], bool)
         is_first[:, 0] = True
         return types.Batch(is_first=is_first, **fields).validate()
+
+    def actions(self, windows: Sequence[windows_lib.Window]) -> np.ndarray:
+        """Their actions, float32 [B, T, 2]."""
+        return np.stack([np.stack([self.get(window.sequence, index)["action"] for index in window.indices])
+                         for window in windows])
 
     def _make(self, sequence: schema.Sequence, index: int) -> prepare.PreparedFrame:
         return prepare.prepare_frame(self.recording.read(sequence, index), self.config)
@@ -148,11 +157,14 @@ class EvaluationBatch:
       batch: the windows; the last ones may be repetitions that fill the batch.
       count: how many of its windows are real; leave the others out of every sum.
       windows: the real windows.
+      others: for each window of the batch another one, of another drive where there is one: whose actions a model that
+        answers to actions must not confuse with the window's own.
     """
 
     batch: types.Batch
     count: int
     windows: tuple[windows_lib.Window, ...]
+    others: tuple[windows_lib.Window, ...]
 
 
 def evaluation_batches(frames: Frames, split: str, *, windows: int, length: int | None = None,
@@ -175,10 +187,12 @@ def evaluation_batches(frames: Frames, split: str, *, windows: int, length: int 
 
 
 def _padded_batches(frames: Frames, chosen: tuple[windows_lib.Window, ...], size: int) -> Iterator[EvaluationBatch]:
+    others = windows_lib.others(chosen)
     for start in range(0, len(chosen), size):
-        real = chosen[start:start + size]
-        filled = real + (real[-1],) * (size - len(real))
-        yield EvaluationBatch(frames.batch(filled), len(real), real)
+        real, beside = chosen[start:start + size], others[start:start + size]
+        missing = size - len(real)
+        yield EvaluationBatch(frames.batch(real + real[-1:] * missing, judged=True), len(real), real,
+                              beside + beside[-1:] * missing)
 
 
 class Prefetch(Generic[_Item]):

@@ -6,6 +6,8 @@
     ROOT/<split>/<run>/lidar/000012.npz         points_m float32 [N, 3], ego frame
     ROOT/<split>/<run>/occupancy/000012.npz     occupancy uint8 [X, Y, Z]
     ROOT/<split>/<run>/route_map/000012.png     8 bit
+    ROOT/<split>/<run>/moving/000012.npz        image_moving_mask bool [H, W] and occupancy_moving_mask bool [X, Y, Z]:
+                                                where road users on the move are (for scores of them)
 
 and, read only where a head learns from them,
 
@@ -35,7 +37,8 @@ DESCRIPTION_FILE = "recording.toml"
 FRAMES_FILE = "frames.csv"
 # RawFrame key -> (folder, suffixes) of the modalities that are files.
 _FILES = {"image": ("image", (".png", ".jpg", ".jpeg")), "points_m": ("lidar", (".npz",)),
-          "occupancy": ("occupancy", (".npz",)), "route_map": ("route_map", (".png",))}
+          "occupancy": ("occupancy", (".npz",)), "route_map": ("route_map", (".png",)),
+          "image_moving_mask": ("moving", (".npz",)), "occupancy_moving_mask": ("moving", (".npz",))}
 _LABEL_FILES = {"depth_m": ("depth", (".png",)), "image_classes": ("classes", (".png",)),
                 "image_instance_mask": ("classes", (".png",)),
                 "birds_eye_classes": ("birds_eye", (".npz",)), "birds_eye_instances": ("birds_eye", (".npz",))}
@@ -133,8 +136,20 @@ class PlainRecording:
         if "route_map" in paths:
             frame["route_map"] = files.read_image(paths["route_map"], "L")
             _check_shape(frame["route_map"], (64, 64), paths["route_map"])
+        self._read_moving(frame, paths)
         self._read_labels(frame, paths)
         return frame
+
+    def _read_moving(self, frame: schema.RawFrame, paths: dict[str, pathlib.Path]) -> None:
+        described = self.description
+        if "image_moving_mask" in paths and described.camera is not None:
+            place, size = paths["image_moving_mask"], (described.camera.height_px, described.camera.width_px)
+            frame["image_moving_mask"] = files.read_npz(place, "image_moving_mask").astype(bool, copy=False)
+            _check_shape(frame["image_moving_mask"], size, place)
+        if "occupancy_moving_mask" in paths and described.voxels is not None:
+            place = paths["occupancy_moving_mask"]
+            frame["occupancy_moving_mask"] = files.read_npz(place, "occupancy_moving_mask").astype(bool, copy=False)
+            _check_shape(frame["occupancy_moving_mask"], described.voxels.shape, place)
 
     def _read_labels(self, frame: schema.RawFrame, paths: dict[str, pathlib.Path]) -> None:
         """Adds what was asked for of schema.LABELS."""

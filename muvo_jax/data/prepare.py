@@ -30,6 +30,7 @@ _ALWAYS_THERE = frozenset({"image", "range_view", "occupancy", "action"})
 _MADE_OF = {"ego_motion": frozenset({"pose", "speed_mps"}), "range_view_classes": frozenset({"point_classes"}),
             "depth_m": frozenset({"depth_m"}), "image_classes": frozenset({"image_classes"}),
             "image_instance_mask": frozenset({"image_instance_mask"})}
+_JUDGED = frozenset({"speed_mps", "ego_motion", "image_moving_mask", "occupancy_moving_mask"})
 DEPTH_LIMIT_M = 100.0  # what is farther counts as nothing
 UNLABELLED = 255
 NAVIGATION = ("command", "next_command", "target_m", "next_target_m")
@@ -97,14 +98,30 @@ def prepare_frame(raw: schema.RawFrame, config: config_lib.Config) -> PreparedFr
         ready |= {name: raw[name] for name in NAVIGATION}  # type: ignore[literal-required]
     if model.route:
         ready["route_map"] = raw["route_map"]
-    if model.speed or model.kinematics is not None:
+    if "speed_mps" in raw:
         ready["speed_mps"] = raw["speed_mps"]
     for name in ("reward", "is_terminal", *(config.targets.keys() - _ALWAYS_THERE - _MADE_OF.keys())):
         if name in raw:
             ready[name] = raw[name]  # type: ignore[literal-required]
-    if "ego_motion" in config.targets:  # still in the frame of the run: motion begins with a second frame
+    if "pose" in raw and "speed_mps" in raw:  # still in the frame of the run: motion begins with a second frame
         ready["ego_motion"] = np.array([*raw["pose"], raw["speed_mps"]])
-    return ready | _labels(raw, config)
+    return ready | _moving(raw, ready, config) | _labels(raw, config)
+
+
+def judged_only(config: config_lib.Config) -> frozenset[str]:
+    """The fields of a prepared frame that scores read and training does not, as far as a recording has them."""
+    trained = {"speed_mps"} if config.model.speed else set()
+    return _JUDGED - trained - config.targets.keys()
+
+
+def _moving(raw: schema.RawFrame, ready: PreparedFrame, config: config_lib.Config) -> PreparedFrame:
+    """Where road users on the move are, for the modalities that the frame has."""
+    masks: PreparedFrame = {}
+    if "image_moving_mask" in raw and "image" in ready:
+        masks["image_moving_mask"] = camera_ops.resize_crop_nearest(raw["image_moving_mask"], config.model.image_size)
+    if "occupancy_moving_mask" in raw and "occupancy" in ready:
+        masks["occupancy_moving_mask"] = raw["occupancy_moving_mask"]
+    return masks
 
 
 def _labels(raw: schema.RawFrame, config: config_lib.Config) -> PreparedFrame:

@@ -27,6 +27,7 @@ COLUMNS = ("frame_id", "timestamp_s", "x_m", "y_m", "yaw_rad", "speed_mps", "acc
            "is_terminal", "weather")
 DEPTH_UNIT_M, DEPTH_SKY = plain.DEPTH_UNIT_M, plain.DEPTH_SKY
 _IMAGES = ("image", "classes", "route_map")
+_MOVING = ("image_moving_mask", "occupancy_moving_mask")
 _ARRAYS = {"points_m": "lidar", "occupancy": "occupancy"}
 
 
@@ -81,6 +82,7 @@ class RunWriter:
         Args:
           frame: frame_id (int) and timestamp_s; the other names of COLUMNS as far as they are known; and any of
             image uint8 [H, W, 3], depth_m float [H, W] (infinite in the sky), classes and route_map uint8 [H, W],
+            image_moving_mask bool [H, W] and occupancy_moving_mask bool [X, Y, Z],
             points_m float [N, 3] (with point_tags uint8 [N], what each hit), occupancy uint8 [X, Y, Z],
             birds_eye_classes uint8 [X, Y] with birds_eye_instances int32 [X, Y].
 
@@ -105,6 +107,8 @@ class RunWriter:
             arrays = {"birds_eye_classes": np.asarray(frame["birds_eye_classes"], np.uint8),
                       "birds_eye_instances": np.asarray(frame["birds_eye_instances"], np.int32)}
             self._path("birds_eye", frame_id, ".npz").write_bytes(npz_bytes(arrays))
+        if moving := {name: np.asarray(frame[name], bool) for name in _MOVING if name in frame}:
+            self._path("moving", frame_id, ".npz").write_bytes(npz_bytes(moving))
         self._rows.append([_cell(frame.get(name, "")) for name in COLUMNS])
 
     def close(self) -> None:

@@ -38,6 +38,7 @@ class RawFrame(TypedDict, total=False):
       points_m: float32 [N, 3], ego frame.
       occupancy: uint8 [X, Y, Z], 0 empty, 1 occupied, 255 unknown, in the grid `RecordingDescription.voxels`.
       route_map: uint8 [64, 64].
+      image_moving_mask: bool [H, W] and occupancy_moving_mask: bool [X, Y, Z], where road users on the move are.
       depth_m: float32 [H, W], along the optical axis, infinite in the sky; image_classes: uint8 [H, W], index into
         RecordingDescription.classes; image_instance_mask: bool [H, W], where these are INSTANCE_CLASSES;
         point_classes: uint8 [N], of points_m; birds_eye_classes: uint8 [X, Y] and birds_eye_instances: int32 [X, Y],
@@ -56,6 +57,8 @@ class RawFrame(TypedDict, total=False):
     points_m: np.ndarray
     occupancy: np.ndarray
     route_map: np.ndarray
+    image_moving_mask: np.ndarray
+    occupancy_moving_mask: np.ndarray
     depth_m: np.ndarray
     image_classes: np.ndarray
     image_instance_mask: np.ndarray

@@ -51,6 +51,16 @@ def spread(windows: tuple[Window, ...], count: int) -> tuple[Window, ...]:
     return tuple(windows[index] for index in picked)
 
 
+def others(windows: tuple[Window, ...]) -> tuple[Window, ...]:
+    """For each window another one: the first of another drive from half the list on, or what stands there."""
+    count, drives = len(windows), [window.sequence.name for window in windows]
+    found = []
+    for index, drive in enumerate(drives):
+        places = [(index + count // 2 + step) % count for step in range(count)] if len(set(drives)) > 1 else []
+        found.append(next((place for place in places if drives[place] != drive), (index + count // 2) % count))
+    return tuple(windows[place] for place in found)
+
+
 class FrameCache:
     """Prepared frames by key, the least recently used dropped first; safe to use from several threads.
 

@@ -12,13 +12,15 @@ from scipy import spatial
 from muvo_jax import types
 
 
-def range_view_points(range_view: types.ArrayLike, return_threshold_m: float = 0.0) -> np.ndarray:
+def range_view_points(range_view: types.ArrayLike, return_threshold_m: float = 0.0,
+                      above_m: float = -np.inf) -> np.ndarray:
     """float32 [P, 3]: the points of a range view [Hr, Wr, 4] whose range is above the threshold.
 
-    The threshold is 0 for a measured range view, whose holes hold -1, and larger for a predicted one.
+    The threshold is 0 for a measured range view, whose holes hold -1, and larger for a predicted one. Of the points
+    only those higher than `above_m` over the ground under the ego are taken.
     """
     range_view = np.asarray(range_view)
-    return range_view[range_view[..., 3] > return_threshold_m][:, :3]
+    return range_view[(range_view[..., 3] > return_threshold_m) & (range_view[..., 2] > above_m)][:, :3]
 
 
 def keyed_subset(points: np.ndarray, count: int, seed: tuple[int, ...]) -> np.ndarray:
@@ -44,7 +46,7 @@ def chamfer_m(prediction: np.ndarray, truth: np.ndarray) -> float:
 
 
 def frame_chamfer_m(prediction: types.ArrayLike, truth: types.ArrayLike, *, return_threshold_m: float, points: int,
-                    seed: tuple[int, ...]) -> np.ndarray:
+                    seed: tuple[int, ...], above_m: float = -np.inf) -> np.ndarray:
     """Chamfer distances of windows of range views.
 
     Args:
@@ -52,6 +54,7 @@ def frame_chamfer_m(prediction: types.ArrayLike, truth: types.ArrayLike, *, retu
       return_threshold_m: a predicted return is a predicted range above this.
       points: size of the keyed subset of each side, 0 for all points.
       seed: names this batch; the frame's place is added to it.
+      above_m: only points higher than this count, of either side.
 
     Returns:
       float64 [B, H], NaN where one side of a frame is empty.
@@ -59,8 +62,8 @@ def frame_chamfer_m(prediction: types.ArrayLike, truth: types.ArrayLike, *, retu
     prediction, truth = np.asarray(prediction), np.asarray(truth)
     distances = np.empty(prediction.shape[:2])
     for window, step in np.ndindex(distances.shape):
-        clouds = (range_view_points(prediction[window, step], return_threshold_m),
-                  range_view_points(truth[window, step]))
+        clouds = (range_view_points(prediction[window, step], return_threshold_m, above_m),
+                  range_view_points(truth[window, step], 0.0, above_m))
         distances[window, step] = chamfer_m(*(keyed_subset(cloud, points, (*seed, window, step, side))
                                               for side, cloud in enumerate(clouds)))
     return distances

@@ -1,27 +1,46 @@
 """The evaluation protocol: observe the context, imagine the horizon under the recorded actions, score every frame.
 
-Scores are kept per step and averaged, for the model and beside it for two baselines: copy-last (the last observed
-frame, of imagined steps only) and training mean. A frame for which a score is undefined is counted and left out; what
-is undefined as a whole is NaN, never 0. BatchNorm runs on its running statistics.
+Scores are kept per step and averaged, for the model and beside it for the baselines of baselines.py: copy-last and the
+moved last frames (of imagined steps only) and the training mean. A frame for which a score is undefined is counted and
+left out; what is undefined as a whole is NaN, never 0. BatchNorm runs on its running statistics.
 """
 
 from __future__ import annotations
 
 import functools
-from collections.abc import Iterable, Iterator, Mapping
-from typing import Any
+from collections.abc import Collection, Iterable, Iterator, Mapping
+from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from muvo_jax import config as config_lib
 from muvo_jax import types
-from muvo_jax.metrics import baselines, image, maps, occupancy, points, streaming
+from muvo_jax.metrics import answers, baselines, maps, occupancy, tally, warp
 from muvo_jax.model import rollout, world_model
 
-VERSION = "muvo_jax-1"
+VERSION = "muvo_jax-2"
 PHASES = ("observed", "imagined")
-HEADS = ("image", "range_view", "occupancy")
+HEADS = tally.HEADS
+# What is judged, in the order of tables.
+SOURCES = ("model", "copy_last", "warp_last", "warp_fused", "training_mean")
+_MOTION = {"bicycle": "motion from actions", "none": "motion as recorded"}
+
+
+class Windows(NamedTuple):
+    """What `evaluate` takes at a time.
+
+    Attributes:
+      batch: [B, context + horizon, ...], of always the same size; it may be filled up behind the real windows.
+      drives: of each real window the name of its drive.
+      other_action: float32 [B, context + horizon, 2], of each window the actions of another one, of another drive
+        where there is one; None to leave the answer to actions unmeasured.
+    """
+
+    batch: types.Batch
+    drives: tuple[str, ...]
+    other_action: types.ArrayLike | None = None
 
 
 def identity(config: config_lib.Config) -> str:
@@ -31,7 +50,7 @@ def identity(config: config_lib.Config) -> str:
     latents = "sampled" if evaluation.sampled else "mean"
     return (f"{VERSION}: context {data.context}, horizon {data.horizon}, {frame_s:g} s a step, Chamfer on "
             f"{evaluation.chamfer_points or 'all'} points, return above {evaluation.return_threshold_m:g} m, {latents} "
-            f"latents, seed {evaluation.seed}")
+            f"latents, {_MOTION[config.contract.kinematics]}, seed {evaluation.seed}")
 
 
 def predict(model: world_model.WorldModel, variables: types.Variables, key: types.Array, batch: types.Batch, *,
@@ -49,18 +68,25 @@ def predict(model: world_model.WorldModel, variables: types.Variables, key: type
       {"image": float32 [B, context + horizon, H, W, 3] in [0, 1], "range_view": float32 [...] in metres, "occupancy":
       bool [B, context + horizon, X, Y, Z]}, for the heads that the model has; of optional heads see maps.finish.
     """
-    return jax.device_get(_predict(model, variables, key, batch, context, horizon, sampled))
+    return jax.device_get(_predict(model, variables, key, batch, None, context, horizon, sampled)[0])
 
 
-@functools.partial(jax.jit, static_argnums=(0, 4, 5, 6))
-def _predict(model, variables, key, batch, context, horizon, sampled):
+@functools.partial(jax.jit, static_argnums=(0, 5, 6, 7))
+def _predict(model, variables, key, batch, other_action, context, horizon, sampled):
+    """Frames of observed and imagined steps, and of the steps imagined under other actions (None without them)."""
     key_observe, key_imagine = jax.random.split(key)
     observed = rollout.observe(model, variables, key_observe, batch.time_slice(0, context), sampled=sampled)
-    actions = batch.action[:, context - 1 : context + horizon - 1]
-    dream = rollout.imagine(model, variables, key_imagine, observed.last, actions, sampled=sampled)
-    states = jax.tree.map(lambda *parts: jax.numpy.concatenate(parts, axis=1), observed.states, dream.states)
+    steps = slice(context - 1, context + horizon - 1)
+    plans = [batch.action[:, steps]] + ([] if other_action is None else [other_action[:, steps]])
+    dream = rollout.imagine(model, variables, key_imagine, observed.last, jnp.stack(plans, axis=1), sampled=sampled,
+                            same_noise=True)
+    states = jax.tree.map(lambda seen, dreamt: jnp.concatenate([seen, *jnp.unstack(dreamt, axis=1)], axis=1),
+                          observed.states, dream.states)
     heads = shown_heads(model.config)
-    return finish(model.decode(variables, states, heads, observed.memory))
+    frames = finish(model.decode(variables, states, heads, observed.memory))
+    end = context + horizon
+    return ({name: value[:, :end] for name, value in frames.items()},
+            None if other_action is None else {name: value[:, end:] for name, value in frames.items()})
 
 
 def shown_heads(config: config_lib.ModelConfig) -> tuple[str, ...]:
@@ -82,96 +108,112 @@ def finish(predictions: types.Predictions) -> dict[str, types.Array]:
     return frames
 
 
-class Tally:
-    """Running scores of one source of predictions over the steps of one phase."""
-
-    def __init__(self, steps: int, evaluation: config_lib.EvaluationConfig):
-        self._evaluation = evaluation
-        self._means = {name: streaming.StreamingMean.zeros(steps) for name in (
-            "psnr_db", "chamfer_m", *(score for _, score in maps.FIELDS.values()))}
-        self._occupancy = occupancy.OccupancyScores.zeros(steps)
-        self._seen: set[str] = set()
-
-    def add(self, prediction: Mapping[str, np.ndarray], truth: types.Batch, seed: tuple[int, ...],
-            threshold_m: float) -> None:
-        """Scores frames [B, steps, ...] against the recorded ones; a modality that either lacks is not scored."""
-        present = [head for head in HEADS if head in prediction and getattr(truth, head) is not None]
-        self._seen.update(present)
-        if "image" in present and truth.image is not None:
-            values = np.asarray(image.frame_psnr_db(prediction["image"], truth.image))
-            self._means["psnr_db"] = self._means["psnr_db"].add(values)
-        if "range_view" in present and truth.range_view is not None:
-            distances = points.frame_chamfer_m(prediction["range_view"], truth.range_view, seed=seed,
-                                               return_threshold_m=threshold_m, points=self._evaluation.chamfer_points)
-            self._means["chamfer_m"] = self._means["chamfer_m"].add(distances)
-        if "occupancy" in present:
-            self._occupancy = self._occupancy.add(prediction["occupancy"], np.asarray(truth.occupancy))
-        for head, (field, score) in maps.FIELDS.items():
-            if field in prediction and getattr(truth, field) is not None:
-                values = maps.frame_scores(head, np.asarray(prediction[field]), np.asarray(getattr(truth, field)))
-                self._means[score] = self._means[score].add(values)
-                self._seen.add(head)
-
-    def scores(self) -> dict[str, dict[str, Any]]:
-        """{metric: {"mean", "per_step", "frames", "undefined"}}; NaN where nothing was defined."""
-        result: dict[str, dict[str, Any]] = {}
-        optional = tuple((score, head) for head, (_, score) in maps.FIELDS.items())
-        for name, head in (("psnr_db", "image"), ("chamfer_m", "range_view"), *optional):
-            if head in self._seen:
-                mean = self._means[name]
-                result[name] = {"mean": mean.overall(), "per_step": mean.per_step().tolist(),
-                                "frames": int(mean.count.sum()), "undefined": int(mean.undefined.sum())}
-        if "occupancy" in self._seen:
-            overall = self._occupancy.overall()
-            for name, values in self._occupancy.per_step().items():
-                result[name] = {"mean": overall[name], "per_step": values.tolist()}
-        return result
-
-
-def evaluate(model: world_model.WorldModel, variables: types.Variables, batches: Iterable[tuple[types.Batch, int]],
-             config: config_lib.Config, training_mean: baselines.Frames | None = None) -> dict[str, Any]:
+def evaluate(model: world_model.WorldModel | None, variables: types.Variables | None, windows: Iterable[Windows],
+             config: config_lib.Config, training_mean: baselines.Frames | None = None, *,
+             sources: Collection[str] = SOURCES) -> dict[str, Any]:
     """Scores a model and the baselines on the windows of one split.
 
     Args:
-      model, variables: what is judged.
-      batches: (windows [B, context + horizon, ...], how many of them are real; the rest fills the batch).
+      model, variables: what is judged; None where `sources` lacks "model".
+      windows: of the split.
       config: of the run; `data` and `evaluation` say how.
       training_mean: from baselines.TrainingMean.prediction, or None to leave that baseline out.
+      sources: which of SOURCES to judge.
 
     Returns:
-      JSON-ready {"protocol", "windows", "observed": {source: scores}, "imagined": {source: scores},
-      "copy_last_unknown_voxels"} with sources "model", "copy_last" (imagined steps only) and "training_mean".
+      JSON-ready {"protocol", "windows", "drives", "observed": {source: scores}, "imagined": {source: scores},
+      "action_shuffle": {head: ratio} (answers.py), "copy_last_unknown_voxels", "movers"}; baselines that repeat or move
+      the last observed frame have imagined steps only. "movers" says what their scores look at, None for nothing.
     """
-    data, evaluation = config.data, config.evaluation
-    spans = {"observed": (0, data.context), "imagined": (data.context, data.context + data.horizon)}
-    sources = {phase: ["model"] + (["copy_last"] if phase == "imagined" else [])
-               + (["training_mean"] if training_mean else []) for phase in PHASES}
-    tallies = {(phase, source): Tally(stop - start, evaluation)
-               for phase, (start, stop) in spans.items() for source in sources[phase]}
-    windows = unknown = 0
-    key = jax.random.key(evaluation.seed)
-    dispatched = ((index, batch, count, _predict(model, variables, jax.random.fold_in(key, index), batch, data.context,
-                                                 data.horizon, evaluation.sampled))
-                  for index, (batch, count) in enumerate(batches))
-    for index, batch, count, future in _one_ahead(dispatched):  # the device predicts while the host scores
-        frames, truth = jax.device_get(future), batch[:count]
-        copied, copied_unknown = baselines.copy_last(truth, data.context, data.horizon)
-        unknown += copied_unknown
-        windows += count
-        for (phase, source), tally in tallies.items():
-            start, stop = spans[phase]
-            if source == "model":
-                guess, threshold_m = {name: value[:count, start:stop] for name, value in frames.items()}, \
-                    evaluation.return_threshold_m
-            elif source == "copy_last":
-                guess, threshold_m = copied, 0.0
-            else:
-                guess, threshold_m = _repeat(training_mean or {}, count, stop - start), 0.0
-            tally.add(guess, truth.time_slice(start, stop), (evaluation.seed, index, start), threshold_m)
-    result: dict[str, Any] = {"protocol": identity(config), "windows": windows, "copy_last_unknown_voxels": unknown}
-    for phase in PHASES:
-        result[phase] = {source: tallies[phase, source].scores() for source in sources[phase]}
-    return result
+    judge = _Judge(config, training_mean, sources)
+    key = jax.random.key(config.evaluation.seed)
+    data, sampled = config.data, config.evaluation.sampled
+    dispatched = ((index, item, _predict(model, variables, jax.random.fold_in(key, index), item.batch,
+                                         item.other_action, data.context, data.horizon, sampled)
+                   if "model" in sources else None) for index, item in enumerate(windows))
+    for index, item, future in _one_ahead(dispatched):  # the device predicts while the host scores
+        judge.add(index, item, jax.device_get(future))
+    return judge.report()
+
+
+class _Judge:
+    """Tallies of all sources over one split."""
+
+    def __init__(self, config: config_lib.Config, training_mean: baselines.Frames | None, sources: Collection[str]):
+        self._config, self._mean, self._sources = config, training_mean, sources
+        self._tallies: dict[str, dict[str, tally.Tally]] = {phase: {} for phase in PHASES}
+        self._answers = answers.Answers(config)
+        self._windows = self._unknown = 0
+        self._drives: set[str] = set()
+        self._movers: str | None = None
+
+    def add(self, index: int, item: Windows, predicted: tuple[Mapping[str, np.ndarray], Any] | None) -> None:
+        """With one batch and what the model made of it."""
+        context, count = self._config.data.context, len(item.drives)
+        truth = item.batch[:count]
+        steps = {"observed": (0, context), "imagined": (context, context + self._config.data.horizon)}
+        moved = self._moved(item.batch, count)
+        guesses = self._baselines(truth, count, moved)
+        if predicted is not None:
+            frames, other = ({name: value[:count] for name, value in (part or {}).items()} for part in predicted)
+            for phase, (start, stop) in steps.items():
+                guesses[phase] = {"model": {name: value[:, start:stop] for name, value in frames.items()},
+                                  **guesses[phase]}
+            if other:
+                self._answers.add(guesses["imagined"]["model"], other, truth.time_slice(*steps["imagined"]),
+                                  item.drives)
+        for phase, (start, stop) in steps.items():
+            part = truth.time_slice(start, stop)
+            movers = self._movers_of(part, moved.get("warp_last", {}) if phase == "imagined" else {})
+            for source, guess in guesses[phase].items():
+                threshold_m = self._config.evaluation.return_threshold_m if source == "model" else 0.0
+                self._tallies[phase].setdefault(source, tally.Tally(self._config)).add(
+                    guess, part, item.drives, seed=(self._config.evaluation.seed, index, start),
+                    threshold_m=threshold_m, movers=movers)
+        self._windows += count
+        self._drives.update(item.drives)
+
+    def report(self) -> dict[str, Any]:
+        """See `evaluate`."""
+        scores = {phase: {source: one.scores() for source, one in tallies.items()}
+                  for phase, tallies in self._tallies.items()}
+        return {"protocol": identity(self._config), "windows": self._windows, "drives": len(self._drives),
+                "copy_last_unknown_voxels": self._unknown, "movers": self._movers, **scores,
+                "action_shuffle": self._answers.ratios()}
+
+    def _movers_of(self, truth: types.Batch, moved: baselines.Frames) -> np.ndarray | None:
+        """Which voxels count as movers': the recording's labels, else where the moved last frame is wrong."""
+        if truth.occupancy_moving_mask is not None:
+            self._movers = "road users on the move"
+            return np.asarray(truth.occupancy_moving_mask)
+        if truth.occupancy is None or "occupancy" not in moved:
+            return None
+        self._movers = "voxels that warp-last gets wrong"
+        return moved["occupancy"] != (np.asarray(truth.occupancy) == types.OCCUPANCY_OCCUPIED)
+
+    def _moved(self, batch: types.Batch, count: int) -> dict[str, baselines.Frames]:
+        """The moved frames of the real windows, as far as the motion is known and they are asked for."""
+        data, config = self._config.data, self._config
+        if warp.motion_source(batch, config) is None:
+            return {}
+        labelled = batch.occupancy is None or batch.occupancy_moving_mask is not None
+        wanted = [source for source in ("warp_last", "warp_fused")
+                  if source in self._sources or (source == "warp_last" and not labelled)]
+        return {source: {name: value[:count] for name, value in warp.warp(
+            batch, data.context, data.horizon, config, fused=source == "warp_fused").items()} for source in wanted}
+
+    def _baselines(self, truth: types.Batch, count: int,
+                   moved: Mapping[str, baselines.Frames]) -> dict[str, dict[str, baselines.Frames]]:
+        """Phase -> source -> frames [B, steps, ...]."""
+        data, guesses = self._config.data, {phase: {} for phase in PHASES}
+        if "copy_last" in self._sources:
+            guesses["imagined"]["copy_last"], unknown = baselines.copy_last(truth, data.context, data.horizon)
+            self._unknown += unknown
+        guesses["imagined"] |= {source: frames for source, frames in moved.items() if source in self._sources}
+        if "training_mean" in self._sources and self._mean:
+            guesses["observed"]["training_mean"] = _repeat(self._mean, count, data.context)
+            guesses["imagined"]["training_mean"] = _repeat(self._mean, count, data.horizon)
+        return guesses
 
 
 def _one_ahead(items: Iterable[Any]) -> Iterator[Any]:

@@ -87,7 +87,7 @@ def train(job: Job, show: screen.Screen) -> Outcome:
         frames = pipeline.Frames(recording, config)
         source = pipeline.train_batches(frames, seed=config.train.seed, batch=windows_per_step(config))
         shapes = preparation.expected_batch(config, windows_per_step(config),
-                                            rewards="reward" in recording.description.modalities)
+                                            recorded=recording.description.modalities)
         ready = early.result()
         ready = (preparation.recompile(ready, config, shapes, job.frozen) if ready
                  else preparation.prepare(config, shapes, job.frozen))
@@ -247,14 +247,15 @@ class _Run:
             self._save(data_state, score)
 
     def _validate(self) -> float | None:
-        """Returns the score of the first validation split, the higher the better."""
+        """Returns the mean skill of the validation splits, the higher the better; None where it is undefined."""
         scores = []
         for split in self.validator.splits:
             numbers = self.validator.run(self.state, split)
             self.files.log({"kind": "validation", "split": split, "step": self.done, **numbers})
             self.show.line(f"step {self.done}  {split}: {validation.text(numbers)}")
-            scores.append(-numbers["total"])
-        return scores[0] if scores and math.isfinite(scores[0]) else None
+            scores.append(numbers["skill"])
+        mean = sum(scores) / len(scores) if scores else math.nan
+        return mean if math.isfinite(mean) else None
 
     def _preview(self) -> None:
         if self.job.preview is not None:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 import time
+from collections.abc import Collection
 from typing import Any
 
 import jax
@@ -53,12 +54,17 @@ class Prepared:
         return parallel_lib.place_state(self.step.plan, state)
 
 
-def expected_batch(config: config_lib.Config, windows: int, *, rewards: bool = True) -> types.Batch:
+TOWN_RECORDS = frozenset({"reward", "speed_mps"})
+
+
+def expected_batch(config: config_lib.Config, windows: int, *,
+                   recorded: Collection[str] = TOWN_RECORDS) -> types.Batch:
     """The shapes of a batch of `windows` training windows, as jax.ShapeDtypeStruct leaves.
 
     Args:
       config: adapted to the data, or a preset of the built-in town.
-      rewards: whether the recording holds reward and is_terminal.
+      recorded: modalities of the recording (schema.RecordingDescription); by default what the built-in town has of those
+        that every batch brings along, whatever the model reads.
     """
     model, prefix = config.model, (windows, config.data.frames)
 
@@ -74,8 +80,10 @@ def expected_batch(config: config_lib.Config, windows: int, *, rewards: bool = T
     if model.camera != config_lib.NO_SENSOR or "image" in config.targets:
         fields |= {"intrinsics": shape(np.float32, 3, 3), "camera_to_ego": shape(np.float32, 4, 4)}
     fields |= {name: timed(types.BATCH_FIELDS[name][0], *sizes) for name, sizes in config.targets.items()}
-    if rewards:
+    if "reward" in recorded:
         fields |= {"reward": timed(np.float32), "is_terminal": timed(np.bool_)}
+    if "speed_mps" in recorded:
+        fields["speed_mps"] = timed(np.float32)
     fields["action"] = timed(np.float32, 2)
     return types.Batch(is_first=timed(np.bool_), **fields)
 

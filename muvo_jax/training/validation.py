@@ -1,9 +1,10 @@
-"""What a run looks at now and then: the loss and the evaluation metrics on a few windows of each validation split."""
+"""What a run looks at now and then: the loss, what it imagines beside baselines, on windows of the splits held out."""
 
 from __future__ import annotations
 
 import os
 from collections.abc import Iterator, Mapping
+from typing import Any
 
 import jax
 import numpy as np
@@ -12,7 +13,7 @@ from muvo_jax import config as config_lib
 from muvo_jax import run as run_lib
 from muvo_jax import types
 from muvo_jax.data import pipeline, prepare, schema, sources
-from muvo_jax.metrics import baselines, protocol
+from muvo_jax.metrics import baselines, protocol, skill
 from muvo_jax.model import world_model
 from muvo_jax.objectives import perceptual
 from muvo_jax.training import checkpoint
@@ -20,6 +21,15 @@ from muvo_jax.training import state as state_lib
 from muvo_jax.training import step as step_lib
 
 TRAINING_MEAN_FRAMES = 512
+
+
+# Metric of protocol.evaluate -> its name in metrics.jsonl, for the screen its label and form.
+SHOWN = {
+    "psnr_db": ("imagined_psnr_db", "imagined PSNR", "{:.2f} dB"),
+    "chamfer_m": ("imagined_chamfer_m", "Chamfer", "{:.2f} m"),
+    "iou_occ_above_observed": ("imagined_iou_occ_above", "IoU+ above the road", "{:.3f}"),
+    "iou_occ_observed": ("imagined_iou_occ", "IoU+", "{:.3f}"),
+}
 
 
 class Validator:
@@ -32,33 +42,47 @@ class Validator:
         self._device = jax.devices()[0]
         self._losses = step_lib.make_validation_step(model, config, batch_size=config.evaluation.batch,
                                                      devices=[self._device], frozen=frozen)
+        self._baselines: dict[str, dict[str, Any]] = {}
 
     def run(self, state: state_lib.TrainState, split: str) -> dict[str, float]:
-        """Loss terms and observed PSNR over whole windows, and the scores of imagined frames (NaN where undefined)."""
+        """Numbers for the log (NaN where undefined).
+
+        Loss terms and observed PSNR over whole windows; scores of imagined frames, "imagined_*", and of the baselines
+        beside them, "copy_last_*" and so on; "action_shuffle_*" of each head (metrics/answers.py); "skill" of the
+        imagined frames (metrics/skill.py).
+        """
         state = jax.device_put(state, self._device)
         sums: dict[str, float] = {}
         batches = list(windows(self.frames, split, self.config.train.validation_windows))
-        for batch, _ in batches:  # a window that fills a batch counts twice here: this is a monitor, not the report
-            for name, value in self._losses(state, batch).items():
+        for item in batches:  # a window that fills a batch counts twice here: this is a monitor, not the report
+            for name, value in self._losses(state, item.batch).items():
                 sums[name] = sums.get(name, 0.0) + float(value) / len(batches)
-        report = protocol.evaluate(self.model, state.variables, batches, self.config)
-        scores = report["imagined"]["model"]
-        names = {"psnr_db": "imagined_psnr_db", "chamfer_m": "imagined_chamfer_m",
-                 "iou_occ_observed": "imagined_iou_occ"}
-        return sums | {shown: scores[name]["mean"] for name, shown in names.items() if name in scores}
+        report = protocol.evaluate(self.model, state.variables, batches, self.config, sources=("model",))
+        if split not in self._baselines:  # which see the same windows every time
+            others = [source for source in protocol.SOURCES if source != "model"]
+            self._baselines[split] = protocol.evaluate(None, None, batches, self.config, sources=others)["imagined"]
+        imagined = report["imagined"] | self._baselines[split]
+        for source, scores in imagined.items():
+            for metric, (name, *_) in SHOWN.items():
+                if metric in scores:
+                    sums[name if source == "model" else f"{source}_{metric}"] = scores[metric]["mean"]
+        answers = {f"action_shuffle_{head}": ratio["mean"] for head, ratio in report["action_shuffle"].items()}
+        return sums | answers | {"skill": skill.skill(imagined)}
 
     def example(self, split: str, variables: types.Variables) -> tuple[types.Batch, baselines.Frames]:
         """The first windows of a split, always the same, and what the model makes of them (protocol.predict)."""
-        batch, _ = next(windows(self.frames, split, self.config.evaluation.batch))
+        batch = next(windows(self.frames, split, self.config.evaluation.batch)).batch
         data, evaluation = self.config.data, self.config.evaluation
         frames = protocol.predict(self.model, jax.device_put(variables, self._device), jax.random.key(evaluation.seed),
                                   batch, context=data.context, horizon=data.horizon, sampled=evaluation.sampled)
         return batch, frames
 
 
-def windows(frames: pipeline.Frames, split: str, count: int) -> Iterator[tuple[types.Batch, int]]:
+def windows(frames: pipeline.Frames, split: str, count: int) -> Iterator[protocol.Windows]:
     """At most `count` windows of a split (0: all) as `protocol.evaluate` takes them."""
-    return ((entry.batch, entry.count) for entry in pipeline.evaluation_batches(frames, split, windows=count))
+    for entry in pipeline.evaluation_batches(frames, split, windows=count):
+        drives = tuple(window.sequence.name for window in entry.windows)
+        yield protocol.Windows(entry.batch, drives, frames.actions(entry.others))
 
 
 def windows_of_run(run: run_lib.Run | str | os.PathLike, split: str | None = None, *, count: int,
@@ -91,9 +115,16 @@ def training_sums(frames: pipeline.Frames, most_frames: int = TRAINING_MEAN_FRAM
 
 
 def text(numbers: Mapping[str, float]) -> str:
-    """One line for the screen."""
+    """One line for the screen: the model, behind it in brackets the baseline that the skill refers to."""
     shown = [f"loss {numbers['total']:.4f}"]
-    labels = {"psnr_db": ("observed PSNR", "{:.2f} dB"), "imagined_psnr_db": ("imagined PSNR", "{:.2f} dB"),
-              "imagined_chamfer_m": ("Chamfer", "{:.2f} m"), "imagined_iou_occ": ("IoU+", "{:.3f}")}
-    shown += [f"{label} {style.format(numbers[name])}" for name, (label, style) in labels.items() if name in numbers]
-    return "  ".join(shown)
+    if "psnr_db" in numbers:
+        shown.append(f"observed PSNR {numbers['psnr_db']:.2f} dB")
+    reference = next((source for source in skill.REFERENCES if any(name.startswith(source) for name in numbers)), "")
+    for metric, (name, label, form) in SHOWN.items():
+        if name in numbers:
+            beside = numbers.get(f"{reference}_{metric}")
+            shown.append(f"{label} {form.format(numbers[name])}"
+                         + (f" ({reference.replace('_', '-')} {form.format(beside)})" if beside is not None else ""))
+    ratios = [f"{numbers[name]:.2f}" for head in protocol.HEADS if (name := f"action_shuffle_{head}") in numbers]
+    shown += [f"action shuffle {' / '.join(ratios)}"] if ratios else []
+    return "  ".join([*shown, f"skill {numbers['skill']:+.3f}"] if "skill" in numbers else shown)

@@ -8,7 +8,7 @@ from __future__ import annotations
 import dataclasses
 import os
 import pathlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 
@@ -50,14 +50,15 @@ class Moment:
     """One frame of a dream.
 
     Attributes:
-      truth, dream: what was recorded and what the model says.
+      truth: what was recorded.
+      dreams: title -> what the model says, and what baselines say beside it.
       badge: "observed" or "imagined".
       time_s: since the last observed frame.
       action: float [2], applied from this frame to the next.
     """
 
     truth: View
-    dream: View
+    dreams: Mapping[str, View]
     badge: str
     time_s: float
     action: np.ndarray
@@ -113,34 +114,32 @@ def dream_frame(columns: Sequence[tuple[str, View]], scene: Scene, *, badge: str
 
 
 def sensor_sheet(moments: Sequence[Moment], scene: Scene, *, title: str) -> np.ndarray | None:
-    """Camera and range image, one moment a row: truth left, world model right. None where there is neither."""
+    """Camera and range image, one moment a row: truth left, dreams right. None where there is neither."""
     rows = []
     for moment in moments:
-        pairs = [canvas.stack(list(pair), axis=1) for pair in zip(_wide_panels(moment.truth, scene),
-                                                                  _wide_panels(moment.dream, scene), strict=False)]
-        if not pairs:
+        groups = [canvas.stack(group, axis=1) for group in _side_by_side(moment, scene, _wide_panels)]
+        if not groups:
             return None
-        content = canvas.stack(pairs, axis=0, gap=4)
+        content = canvas.stack(groups, axis=0, gap=4)
         rows.append(canvas.stack([_moment(moment, content.shape[0]), content], axis=1))
-    heads = [canvas.blank(20, 132), _heading("truth", WIDE_PX), _heading("world model", WIDE_PX)]
+    heads = [canvas.blank(20, 132), *(_heading(name, WIDE_PX) for name in ("truth", *moments[0].dreams))]
     page = [_heading(title, rows[0].shape[1], 17), canvas.stack(heads, axis=1), *rows,
             legend(moments[0].truth, scene, rows[0].shape[1], heights=False)]
     return canvas.margin(canvas.stack(page, axis=0, gap=10))
 
 
 def space_sheet(moments: Sequence[Moment], scene: Scene, *, title: str) -> np.ndarray | None:
-    """Bird's-eye points and voxels, one moment a column: truth above, world model below. None without both."""
+    """Bird's-eye points and voxels, one moment a column: truth above, dreams below. None without both."""
     columns = []
     for moment in moments:
-        pairs = [part for pair in zip(_space_panels(moment.truth, scene), _space_panels(moment.dream, scene),
-                                      strict=False) for part in pair]
-        if not pairs:
+        parts = [part for group in _side_by_side(moment, scene, _space_panels) for part in group]
+        if not parts:
             return None
         strip = canvas.tag(f"{moment.badge} {moment.time_s:+.1f} s", canvas.TAG_COLOURS[moment.badge], SQUARE_PX, 12)
-        columns.append(canvas.stack([strip, *pairs], axis=0, gap=5))
+        columns.append(canvas.stack([strip, *parts], axis=0, gap=5))
     first, names = moments[0].truth, [canvas.blank(20, 96)]
     for what, picture in zip(_space_names(first), _space_panels(first, scene), strict=True):
-        names += [_row_name(what, who, picture.shape[0]) for who in ("truth", "world model")]
+        names += [_row_name(what, who, picture.shape[0]) for who in ("truth", *moments[0].dreams)]
     body = canvas.stack([canvas.stack(names, axis=0, gap=5), *columns], axis=1, gap=8)
     page = [_heading(title, body.shape[1], 17), body, legend(first, scene, body.shape[1], ranges=False)]
     return canvas.margin(canvas.stack(page, axis=0, gap=10))
@@ -168,7 +167,8 @@ def legend(view: View, scene: Scene, columns: int, *, ranges: bool = True, heigh
 
 def write_dream(folder: str | os.PathLike, truth: Sequence[View], predictions: Mapping[str, Sequence[View]],
                 actions: np.ndarray, scene: Scene, *, context: int, title: str, name: str = "dream",
-                most_moments: int = 8, animate: bool = True) -> list[pathlib.Path]:
+                beside: Mapping[str, Sequence[View]] | None = None, most_moments: int = 8,
+                animate: bool = True) -> list[pathlib.Path]:
     """Writes NAME.gif, NAME_sensors.png and NAME_space.png for one window.
 
     Args:
@@ -176,19 +176,23 @@ def write_dream(folder: str | os.PathLike, truth: Sequence[View], predictions: M
       predictions: title -> decoded frames, as many as truth (the sheets show the first entry).
       actions: float [frames, 2]; action t is applied from t to t + 1.
       context: how many frames at the start were observed.
+      beside: the same of baselines, shown behind the predictions everywhere.
       most_moments: the sheets show at most this many frames, evenly spread, the last one included.
       animate: also write the animation.
     """
     folder = pathlib.Path(folder)
-    predictions = {label: [view.beside(truth[frame]) for frame, view in enumerate(views)]
-                   for label, views in predictions.items()}
-    dream = next(iter(predictions.values()))
-    moments = [Moment(truth[frame], dream[frame], "observed" if frame < context else "imagined",
+    fitted = lambda several: {label: [view.beside(truth[frame]) for frame, view in enumerate(views)]
+                              for label, views in several.items()}
+    beside, predictions = fitted(beside or {}), fitted(predictions)
+    first = next(iter(predictions))
+    dreams = {first: predictions[first], **beside}
+    moments = [Moment(truth[frame], {label: views[frame] for label, views in dreams.items()},
+                      "observed" if frame < context else "imagined",
                       (frame - context + 1) * scene.frame_s, actions[frame]) for frame in range(len(truth))]
     written = []
     if animate:
         pictures = [dream_frame([("truth", moment.truth), *((label, views[frame])
-                                                            for label, views in predictions.items())],
+                                                            for label, views in {**predictions, **beside}.items())],
                                 scene, badge=moment.badge, caption=f"{moment.time_s:+.1f} s   {title}",
                                 action=moment.action) for frame, moment in enumerate(moments)]
         written.append(canvas.save_gif(folder / f"{name}.gif", pictures, max(scene.frame_s, 0.3)))
@@ -199,6 +203,14 @@ def write_dream(folder: str | os.PathLike, truth: Sequence[View], predictions: M
         if page is not None:
             written.append(canvas.save_png(folder / f"{name}_{suffix}.png", page))
     return written
+
+
+def _side_by_side(moment: Moment, scene: Scene,
+                  panels_of: Callable[[View, Scene], list[np.ndarray]]) -> list[list[np.ndarray]]:
+    """For each panel of the truth the pictures of truth and dreams, blank where a dream ends before it."""
+    truth, *dreams = (panels_of(view, scene) for view in (moment.truth, *moment.dreams.values()))
+    return [[picture, *(dream[index] if index < len(dream) else canvas.blank(*picture.shape[:2]) for dream in dreams)]
+            for index, picture in enumerate(truth)]
 
 
 def _heading(text: str, columns: int, size_px: int = 14) -> np.ndarray:

@@ -6,7 +6,7 @@ import pytest
 import worlds
 
 from muvo_jax import command_line, plan_drive, presets
-from muvo_jax.agents import closed_loop, planners
+from muvo_jax.agents import closed_loop, planners, sensitivity
 from muvo_jax.data.town import settings
 from muvo_jax.data.town import simulator as town_lib
 from muvo_jax.model import world_model
@@ -121,6 +121,22 @@ def test_the_town_gives_what_the_model_reads_at_the_models_rate():
     assert seen["route_map"].shape == (64, 64)
     lifted = dataclasses.replace(config, model=dataclasses.replace(config.model, camera="bev"))
     assert set(plan_drive.observation(town, state, lifted)) >= set(world_model.inputs(lifted.model))
+
+
+def test_geometry_alone_answers_to_the_wheel_as_the_town_does():
+    config = presets.get("tiny")
+    town = town_lib.Town(settings.from_config(config))
+    world = plan_drive.town_simulator(town, config)
+    states = [world.reset(plan_drive.FIRST_SEED + drive) for drive in range(2)]
+    assert plan_drive.contrast_horizons(config) == (2, 4)
+    pair = sensitivity.CONTRASTS["left or right"]
+    truth = lambda state: plan_drive.town_truth(town, state)
+    shown = [[sensitivity.follow(world, truth, state, action, 2) for state in states] for action in pair]
+    moved = [plan_drive.moved_views(town, config, states, action, 2) for action in pair]
+    for head in ("image", "range_view", "occupancy"):
+        true = [np.stack([frames[head] for frames in drives]) for drives in shown]
+        found = sensitivity.score(head, [frames[head] for frames in moved], true)
+        assert found["gain"] > 0.1 and found["correlation"] > 0.1, (head, found)
 
 
 def test_help_shows_examples_and_explains_every_option(capsys):

@@ -46,10 +46,21 @@ def test_the_town_teaches_every_optional_head(recording):
     view = range_view.project(raw["points_m"], CONFIG.model.range_view)
     np.testing.assert_array_equal(batch.range_view_classes[0, 0] == prepare.UNLABELLED, view[..., 3] < 0)
     road_users = np.isin(batch.image_classes, (boxes.VEHICLE, boxes.PEDESTRIAN))
-    assert batch.image_instance_mask.dtype == bool and road_users.any()
+    assert batch.image_instance_mask.dtype == bool and road_users.any() and batch.image_moving_mask is None
     np.testing.assert_array_equal(batch.image_instance_mask, road_users)
     sky = batch.image_classes[0, 0] == boxes.SKY
     assert sky.any() and (batch.depth_m[0, 0][sky] == -1).all() and batch.depth_m.max() <= prepare.DEPTH_LIMIT_M
+
+
+def test_scores_are_told_where_road_users_move_and_training_is_not(recording):
+    config = prepare.adapt(dataclasses.replace(CONFIG, data=dataclasses.replace(CONFIG.data, stride=1)),
+                           recording).config
+    frames, window = pipeline.Frames(recording, config), pipeline.windows_lib.Window(recording.sequences[0], 0, 2, 1)
+    assert not {name for name, value in vars(frames.batch([window])).items() if value is not None and "moving" in name}
+    batch = frames.batch([window], judged=True)
+    raw = recording.read(recording.sequences[0], 1)
+    np.testing.assert_array_equal(batch.image_moving_mask[0, 1], raw["image_moving_mask"])
+    assert batch.occupancy_moving_mask is None  # the model has no occupancy head
 
 
 def test_the_ground_plan_holds_the_road_and_whole_vehicles(recording):

@@ -104,6 +104,7 @@ def test_shapes_and_dtypes(town, drive):
     assert found == {
         "image": (np.uint8, (64, 256, 3)), "depth_m": (np.float32, (64, 256)), "classes": (np.uint8, (64, 256)),
         "range_view": (np.float32, (64, 256, 4)), "route_map": (np.uint8, (64, 64)), "speed_mps": (np.float32, ()),
+        "image_moving_mask": (np.bool_, (64, 256)), "occupancy_moving_mask": (np.bool_, (48, 48, 16)),
         "reward": (np.float32, ()), "is_terminal": (np.bool_, ())}
     assert seen["points_m"].dtype == np.float32 and seen["points_m"].shape[1:] == (3,)
     assert len(seen["points_m"]) > 8000
@@ -113,6 +114,31 @@ def test_every_class_of_the_street_is_seen(town, drive):
     classes = np.unique(np.concatenate([town.render(state)["classes"].ravel() for state in drive]))
     names = {box_lib.CLASSES[index] for index in classes}
     assert {"sky", "road", "marking", "pavement", "grass", "building", "vegetation", "vehicle"} <= names
+
+
+def test_movers_are_road_users_that_move(town, drive):
+    """What is marked shows road users; of these the parked and the waiting ones are not; a moving one's voxels hold its
+    points; and where nobody moves nothing is marked."""
+    marked = parked = inside = 0
+    grid = town.config.voxels
+    for state in drive:
+        seen = town.render(state)
+        road_users = np.isin(seen["classes"], (box_lib.VEHICLE, box_lib.PEDESTRIAN))
+        assert not (seen["image_moving_mask"] & ~road_users).any()
+        marked, parked = marked + seen["image_moving_mask"].sum(), parked + (
+            road_users & ~seen["image_moving_mask"]).sum()
+        points_m = camera_ops.depth_to_points(np.where(seen["image_moving_mask"], seen["depth_m"], np.inf),
+                                              town.renderer.intrinsics, town.renderer.camera_to_ego)
+        hit = voxels.voxelize(points_m, grid) > 0
+        assert not (hit & ~seen["occupancy_moving_mask"]).any()
+        inside += hit.sum()
+    assert marked > 100 and parked > 100 and inside > 10
+    state = drive[-1]
+    still = dataclasses.replace(state, traffic=dataclasses.replace(
+        state.traffic, speed_mps=0 * state.traffic.speed_mps, crosses=np.ones_like(state.traffic.crosses),
+        walked_m=0 * state.traffic.walked_m))
+    seen = town.render(still)
+    assert not seen["image_moving_mask"].any() and not seen["occupancy_moving_mask"].any()
 
 
 def test_lidar_points_lie_on_the_depth_map(town, drive):

@@ -20,19 +20,26 @@ def test_bytes_are_scaled_and_identity_is_capped():
     assert image.frame_psnr_db(target.astype(np.float32) / 255, target)[0] == image.PSNR_LIMIT_DB
 
 
+def mean_of(*values):
+    """What is reported of values [B, H] fed one after the other."""
+    sums = streaming.DriveSums()
+    for part in values:
+        sums.add(("",) * len(part), streaming.mean_sums(part))
+    return streaming.summary(sums, streaming.mean, 0)["mean"]
+
+
 def test_frames_are_averaged_in_decibels():
     # mse 1e-2 and 1e-4: the mean of 20 and 40 dB is 30, that of the pooled mse would be 23.
-    stream = streaming.StreamingMean.zeros(1).add(np.array([[20.0]])).add(np.array([[40.0]]))
-    assert stream.overall() == 30.0
+    assert mean_of(np.array([[20.0]]), np.array([[40.0]])) == 30.0
 
 
-def test_streaming_keeps_steps_apart_and_counts_undefined():
-    stream = streaming.StreamingMean.zeros(2).add(np.array([[1.0, np.nan], [3.0, np.nan]]))
-    np.testing.assert_array_equal(stream.per_step(), [2.0, np.nan])
-    np.testing.assert_array_equal(stream.count, [2, 0])
-    np.testing.assert_array_equal(stream.undefined, [0, 2])
-    assert stream.overall() == 2.0
-    assert np.isnan(streaming.StreamingMean.zeros(3).overall())
+def test_the_pixels_of_a_mask_are_pooled_over_frames():
+    """One frame shows one such pixel, mse 1e-2, the other three, mse 1e-4: 10 log10 of 4 / (1e-2 + 3e-4)."""
+    target, mask = np.zeros((1, 2, 2, 2, 3), np.uint8), np.array([[[[1, 0], [0, 0]], [[1, 1], [1, 0]]]], bool)
+    prediction = np.stack([np.full((2, 2, 3), value, np.float32) for value in (0.1, 0.01)])[None]
+    sums = {name: value.sum() for name, value in image.masked_sums(prediction, target, mask).items()}
+    np.testing.assert_allclose(image.masked_psnr_db(sums), 10 * np.log10(4 / (1e-2 + 3e-4)), rtol=1e-5)
+    assert np.isnan(image.masked_psnr_db({"error": np.float64(0), "pixels": np.int64(0)}))
 
 
 def test_parity_with_the_reference():
@@ -43,5 +50,4 @@ def test_parity_with_the_reference():
     assert golden.error("psnr_per_frame", first) < 1e-5
     assert golden.error("metric_psnr_1batch", first.mean()) < 1e-5
     second = image.frame_psnr_db(0.9 * target, target)
-    stream = streaming.StreamingMean.zeros(2).add(first).add(second)
-    assert golden.error("metric_psnr_2batches", stream.overall()) < 1e-5
+    assert golden.error("metric_psnr_2batches", mean_of(first, second)) < 1e-5

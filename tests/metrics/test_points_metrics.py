@@ -33,8 +33,15 @@ def test_an_empty_side_is_undefined_and_not_averaged():
     prediction = np.concatenate([range_view((2, 0, 0, 2))] * 2, axis=1)
     distance = points.frame_chamfer_m(prediction, truth, return_threshold_m=1.0, points=0, seed=(0,))
     np.testing.assert_array_equal(distance, [[1.0, np.nan]])
-    stream = streaming.StreamingMean.zeros(2).add(distance)
-    assert (stream.overall(), stream.undefined.sum()) == (1.0, 1)
+    sums = streaming.mean_sums(distance)
+    assert (sums["total"].sum(), sums["count"].sum(), sums["undefined"].sum()) == (1.0, 1, 1)
+
+
+def test_points_on_the_road_do_not_count_above_it():
+    truth = range_view((1, 0, 0, 1), (4, 0, 1.0, 4), (9, 0, 0.4, 9))
+    prediction = range_view((7, 0, 0, 7), (4, 2, 1.0, 5))
+    distance = points.frame_chamfer_m(prediction, truth, return_threshold_m=1.0, points=0, seed=(0,), above_m=0.5)
+    np.testing.assert_allclose(distance, [[2.0]])
 
 
 def test_subsets_are_keyed():
@@ -52,9 +59,10 @@ def test_parity_with_the_reference():
     golden = golden_rule.Golden("p1_losses_metrics.npz")
     prediction, truth = (30 * golden_rule.make_input(name, (2, 2, 400, 3), "pm1") * np.float32([1, 1, 0.2])
                          for name in ("cd_pred", "cd_tgt"))
-    stream = streaming.StreamingMean.zeros(1)
+    sums = streaming.DriveSums()
     for clouds in (prediction, truth + np.float32(0.1)):
         frames = zip(clouds.reshape(4, 400, 3), truth.reshape(4, 400, 3), strict=True)
         distances = [points.chamfer_m(*frame) for frame in frames]
-        stream = stream.add(np.array(distances)[:, None])
-    assert stream.overall() == pytest.approx(float(golden["metric_cd_1d_2batches"]), rel=1e-5)
+        sums.add(("",) * 4, streaming.mean_sums(np.array(distances)[:, None]))
+    mean_m = streaming.summary(sums, streaming.mean, 0)["mean"]
+    assert mean_m == pytest.approx(float(golden["metric_cd_1d_2batches"]), rel=1e-5)

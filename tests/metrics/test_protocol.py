@@ -6,6 +6,7 @@ import jax
 import numpy as np
 import pytest
 
+from muvo_jax import config as config_lib
 from muvo_jax import presets, types
 from muvo_jax.metrics import protocol
 
@@ -38,10 +39,13 @@ def _perfect(batch):
             "occupancy": batch.occupancy == 1}
 
 
-def _evaluate(monkeypatch, config, predictions, batches, mean=None):
+def _evaluate(monkeypatch, config, predictions, batches, mean=None, other=None):
+    """Every real window is a drive of its own; with `other` these frames are imagined under other actions."""
     answers = iter(predictions)
-    monkeypatch.setattr(protocol, "_predict", lambda *_: next(answers))
-    return protocol.evaluate(None, None, batches, config, mean)
+    monkeypatch.setattr(protocol, "_predict", lambda *_: (next(answers), other))
+    windows = [protocol.Windows(batch, tuple(f"{index}-{row}" for row in range(count)))
+               for index, (batch, count) in enumerate(batches)]
+    return protocol.evaluate(None, None, windows, config, mean)
 
 
 def test_a_perfect_model_is_perfect_and_copy_last_falls_behind_step_by_step(monkeypatch, config):
@@ -99,6 +103,52 @@ def test_the_training_mean_is_scored_in_both_phases_and_missing_heads_in_none(mo
                                [100.0, -20 * np.log10(10 / 255)], rtol=1e-5)
 
 
+def test_the_answer_to_actions_is_the_error_under_others_over_the_error_under_the_recorded_ones(monkeypatch, config):
+    """The recorded actions leave an error of 1 grey level and 1 m, the others one of 3 grey levels and 1 m."""
+    batch = _batch()
+    part = batch.time_slice(CONTEXT, CONTEXT + HORIZON)
+
+    def off(frames, grey, metres):
+        guess = {"image": (frames.image.astype(np.float32) + grey) / 255.0, "range_view": frames.range_view.copy()}
+        guess["range_view"][..., 3] += metres
+        return guess
+
+    report = _evaluate(monkeypatch, config, [off(batch, 1, 1.0)], [(batch, 2)], other=off(part, 3, -1.0))
+    assert report["action_shuffle"]["image"]["mean"] == pytest.approx(9.0, rel=1e-4)
+    assert report["action_shuffle"]["range_view"]["per_step"] == pytest.approx([1.0, 1.0, 1.0])
+    assert "occupancy" not in report["action_shuffle"]
+
+
+def test_movers_are_scored_by_the_pixels_and_voxels_they_cover(monkeypatch, config):
+    grid = config_lib.VoxelGrid((8, 1, 1), 1.0, (-4.0, -0.5, 0.5))
+    config = dataclasses.replace(config, model=dataclasses.replace(
+        config.model, latent="1d", heads=("image",), voxels=grid))
+    batch = _batch()
+    pixels, voxels = np.zeros(batch.image.shape[:-1], bool), np.zeros(batch.occupancy.shape, bool)
+    pixels[:, :, 0, 0] = voxels[:, :, 4:] = True  # the wall's voxels of the last step, the one of frame 4
+    batch = batch.replace(image_moving_mask=pixels, occupancy_moving_mask=voxels)
+    guess = _perfect(batch)
+    guess["image"] = np.where(pixels[..., None], guess["image"] + 0.1, guess["image"])
+    guess["occupancy"] = guess["occupancy"].copy()
+    guess["occupancy"][:, :, :4] = False  # wrong, but no mover
+    report = _evaluate(monkeypatch, config, [guess], [(batch, 2)])
+    scores = report["imagined"]["model"]
+    assert scores["psnr_movers_db"]["mean"] == pytest.approx(20.0, rel=1e-4) and scores["psnr_db"]["mean"] > 30
+    assert scores["iou_occ_movers"]["mean"] == 1.0 and scores["iou_occ_above_observed"]["mean"] == pytest.approx(1 / 3)
+    assert report["movers"] == "road users on the move"
+
+
+def test_intervals_come_from_drives(monkeypatch, config):
+    batch = _batch()
+    wrong = {name: value.copy() for name, value in _perfect(batch).items()}
+    wrong["occupancy"][1] = False
+    low, high = _evaluate(monkeypatch, config, [wrong], [(batch, 2)])["imagined"]["model"]["iou_occ_observed"][
+        "interval"]
+    assert (low, high) == (0.0, 1.0)
+    assert np.isnan(_evaluate(monkeypatch, config, [wrong], [(batch, 1)])["imagined"]["model"]["psnr_db"][
+        "interval"]).all()
+
+
 def test_unknown_voxels_are_ignored_or_empty(monkeypatch, config):
     batch = _batch()
     eager = {**_perfect(batch), "occupancy": _perfect(batch)["occupancy"] | (batch.occupancy == 255)}
@@ -129,9 +179,9 @@ def test_imagined_steps_are_driven_by_the_action_before_them(monkeypatch, config
         states = types.LatentState(np.zeros((2, batch.frames, 2)), np.zeros((2, batch.frames, 2)))
         return types.Observed(states, None, None)
 
-    def imagine(model, variables, key, state, actions, *, sampled):
+    def imagine(model, variables, key, state, actions, *, sampled, same_noise):
         calls["actions"] = actions
-        states = types.LatentState(np.ones((2, HORIZON, 2)), np.ones((2, HORIZON, 2)))
+        states = types.LatentState(*(np.ones((2, actions.shape[1], HORIZON, 2)) for _ in range(2)))
         return types.Dream(states, actions, None)
 
     monkeypatch.setattr(protocol.rollout, "observe", observe)
@@ -142,5 +192,5 @@ def test_imagined_steps_are_driven_by_the_action_before_them(monkeypatch, config
         frames = protocol.predict(Model(), {}, jax.random.key(0), batch, context=CONTEXT, horizon=HORIZON,
                                   sampled=False)
     assert calls["observed"] == CONTEXT
-    np.testing.assert_array_equal(calls["actions"], batch.action[:, 1:4])
+    np.testing.assert_array_equal(calls["actions"], batch.action[:, None, 1:4])
     np.testing.assert_array_equal(frames["image"][0, :, 0, 0, 0], [0, 0, 1, 1, 1])

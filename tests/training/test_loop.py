@@ -17,7 +17,7 @@ from muvo_jax import config as config_lib
 from muvo_jax import presets
 from muvo_jax.data import schema
 from muvo_jax.model import world_model
-from muvo_jax.training import checkpoint, integrity, loop, preparation, run_folder, screen
+from muvo_jax.training import checkpoint, checkpoint_meta, integrity, loop, preparation, run_folder, screen
 
 STEPS = 6
 INTRINSICS = ((32.0, 0.0, 32.0), (0.0, 32.0, 16.0), (0.0, 0.0, 1.0))
@@ -149,7 +149,15 @@ def test_a_run_leaves_its_files_and_says_what_it_does(uninterrupted):
 def test_validation_reports_loss_and_imagined_scores(uninterrupted):
     record = next(record for record in _losses(uninterrupted[0]) if record["kind"] == "validation")
     assert record["split"] == "val_rl"
-    assert np.isfinite([record[name] for name in ("total", "psnr_db", "imagined_psnr_db")]).all()
+    assert np.isfinite([record[name] for name in ("total", "psnr_db", "imagined_psnr_db", "copy_last_psnr_db",
+                                                  "action_shuffle_image", "skill")]).all()
+
+
+def test_the_best_checkpoint_is_the_most_skilful_one(uninterrupted):
+    folder = uninterrupted[0]
+    skills = {record["step"]: record["skill"] for record in _losses(folder) if record["kind"] == "validation"}
+    kept = checkpoint_meta.read(folder / "checkpoints" / "6")
+    assert kept["score"] == pytest.approx(skills[6])
 
 
 def test_a_killed_run_resumes_to_the_same_numbers(tmp_path, uninterrupted):

@@ -1,5 +1,7 @@
 """Pictures: orientation, colours, tags and files. (How they look has to be looked at.)"""
 
+import dataclasses
+
 import numpy as np
 import pytest
 from PIL import Image
@@ -127,6 +129,20 @@ def test_write_dream_writes_readable_files_of_every_frame(tmp_path):
         with Image.open(path) as picture:
             picture.verify()
     assert not list(tmp_path.glob("*.part"))
+
+
+def test_a_baseline_stands_beside_the_dream_on_every_sheet(tmp_path):
+    """Without the optional maps, which it does not predict: there its place stays empty."""
+    maps = {"depth_m": np.ones((4, 8), np.float32)}
+    views = [dataclasses.replace(_view(seed), **maps) for seed in range(2)]
+    sizes = []
+    for beside in ({}, {"warp-last": [_view(2), _view(3)]}):
+        paths = sheets.write_dream(tmp_path, views, {"world model": views}, np.zeros((2, 2)), SCENE, context=1,
+                                   title="t", beside=beside)
+        sizes.append([Image.open(path).size for path in paths])
+    (animation, sensors, space), (wider, wider_sensors, taller_space) = sizes
+    assert wider[0] > animation[0] and wider_sensors[0] > sensors[0] and wider_sensors[1] == sensors[1]
+    assert taller_space[1] > space[1] and taller_space[0] == space[0]
 
 
 def test_a_recording_with_a_camera_alone_has_no_space_sheet(tmp_path):

@@ -1,6 +1,8 @@
-"""What the optional heads learn in the town: the class of every lidar point, and the ground plan from above.
+"""What is known of a moment in the town beside what the sensors show.
 
-Recorded only where a head asks for it (TownConfig.labels); camera depth and classes are in every recording.
+Which pixels and voxels moving road users cover is in every recording, as camera depth and classes are: scores are told
+apart by it. What optional heads learn, the class of every lidar point and the ground plan from above, is recorded only
+where a head asks for it (TownConfig.labels).
 """
 
 from __future__ import annotations
@@ -59,3 +61,38 @@ def ground_plan(pose: np.ndarray, boxes: box_lib.Boxes, ground: ground_lib.Groun
                 count += 1
                 classes[inside], instances[inside] = kind, count
     return classes.reshape(grid.shape[:2]), instances.reshape(grid.shape[:2])
+
+
+def moving_pixels(hits: raycast.Hits, first: int, moves: np.ndarray) -> np.ndarray:
+    """bool [rows, columns], whether a ray met a road user on the move.
+
+    Args:
+      hits: of the camera.
+      first: number of the box that `moves` [M] begins with.
+    """
+    known = np.append(moves, False)  # the last place is for rays that met anything else
+    index = hits.box - first
+    return np.ascontiguousarray(known[np.where(index >= 0, index, len(moves))].T)
+
+
+def moving_voxels(pose: np.ndarray, movers: box_lib.Boxes, grid: config_lib.VoxelGrid) -> np.ndarray:
+    """bool [X, Y, Z], the voxels of the ego's grid whose middle is in one of the boxes or within a voxel of it.
+
+    The voxel around them belongs to it, lest filling the neighbourhood of a road user cost nothing.
+    """
+    mask = np.zeros(grid.shape, bool)
+    side_m = grid.voxel_size_m
+    ahead_m, left_m, up_m = ((np.arange(grid.shape[axis]) + 0.5) * side_m + grid.origin_m[axis] for axis in range(3))
+    cosine, sine = np.cos(pose[2]), np.sin(pose[2])
+    turn = np.array([[cosine, -sine], [sine, cosine]])
+    centre_m = (movers.centre_m - pose[None, :2]) @ turn
+    heading = movers.heading @ turn
+    reach_m = np.hypot(*grid.shape[:2]) * side_m
+    for index in np.flatnonzero(np.hypot(centre_m[:, 0], centre_m[:, 1]) < reach_m):
+        ahead, left = ahead_m[:, None] - centre_m[index, 0], left_m[None] - centre_m[index, 1]
+        along_m = np.abs(ahead * heading[index, 0] + left * heading[index, 1])
+        across_m = np.abs(left * heading[index, 0] - ahead * heading[index, 1])
+        covered = (along_m <= movers.half_m[index, 0] + side_m) & (across_m <= movers.half_m[index, 1] + side_m)
+        height = (up_m >= movers.z_m[index, 0] - side_m) & (up_m <= movers.z_m[index, 1] + side_m)
+        mask |= covered[..., None] & height
+    return mask

@@ -31,7 +31,7 @@ except ImportError:  # Windows: there it is up to the user not to record the sam
     fcntl = None
 
 # Raised by whatever changes the bytes of a recording, so that old caches are not taken for new ones.
-RECORDING_VERSION = 1
+RECORDING_VERSION = 2
 COMPLETE_FILE = "complete.json"
 # Frames before the first recorded one: the expert has settled and traffic has spread.
 WARM_UP_FRAMES = 20

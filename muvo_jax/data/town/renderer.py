@@ -51,21 +51,23 @@ class Renderer:
         self._camera_rays = np.stack(np.broadcast_arrays(1.0, -right[None], -down[:, None]), -1).astype(np.float32)
         self._strides = _carving_strides(config, float(self.intrinsics[0, 0]))
 
-    def render(self, pose: np.ndarray, moving: box_lib.Boxes, weather: settings.Weather,
+    def render(self, pose: np.ndarray, moving: box_lib.Boxes, moves: np.ndarray, weather: settings.Weather,
                noise_seed: list[int]) -> dict[str, np.ndarray]:
         """Renders a moment.
 
         Args:
           pose: [3], x, y, yaw of the ego origin in the frame of the map.
           moving: everything beside the scenery.
+          moves: bool [len(moving)], which of it is a road user on the move now (shadows are none).
           weather: the light.
           noise_seed: what rain streaks and sensor noise are drawn from.
 
         Returns:
           image uint8 [H, W, 3]; depth_m float32 [H, W] along the optical axis, infinite in the sky; classes uint8
           [H, W], indices into boxes.CLASSES; range_view float32 [rows, columns, 4] as in muvo_jax.types.Batch, and
-          points_m float32 [N, 3], its returns (ego frame). With TownConfig.labels also point_tags uint8 [N], the class
-          of each point, and birds_eye_classes and birds_eye_instances [X, Y], see labels.ground_plan.
+          points_m float32 [N, 3], its returns (ego frame); image_moving_mask bool [H, W] and occupancy_moving_mask bool
+          [X, Y, Z], see labels.moving_pixels and moving_voxels. With TownConfig.labels also point_tags uint8 [N], the
+          class of each point, and birds_eye_classes and birds_eye_instances [X, Y], see labels.ground_plan.
         """
         x, y, yaw_rad = (float(value) for value in pose)
         cosine, sine = np.cos(yaw_rad), np.sin(yaw_rad)
@@ -81,7 +83,9 @@ class Renderer:
         scan = raycast.cast(self.lidar_fan, origin_m, yaw_rad, boxes)
         view = self._range_view(scan)
         seen = {"image": image, "depth_m": np.ascontiguousarray((hits.distance_m / self._stretch[:, None]).T),
-                "classes": classes, "range_view": view, "points_m": range_ops.to_points(view)}
+                "classes": classes, "range_view": view, "points_m": range_ops.to_points(view),
+                "image_moving_mask": labels.moving_pixels(hits, len(boxes) - len(moving), moves),
+                "occupancy_moving_mask": labels.moving_voxels(pose, moving.take(moves), self.config.voxels)}
         if self.config.labels:
             tags = labels.ray_classes(self.lidar_fan, scan, origin_m, yaw_rad, boxes, self.ground)
             seen["point_tags"] = tags[view[..., 3] > 0.0]

@@ -159,7 +159,10 @@ class Town:
         Beside them: route_map uint8 [64, 64], speed_mps float32, reward float32, is_terminal bool.
         """
         weather = settings.WEATHERS[WEATHER_NAMES[int(state.weather)]]
-        seen = self.renderer.render(state.pose, self._moving_boxes(state), weather, [int(state.seed), int(state.frame)])
+        cars_move, people_move = traffic_lib.moving(state.traffic)
+        moves = np.concatenate([cars_move, cars_move, np.zeros_like(cars_move), people_move, people_move])
+        seen = self.renderer.render(state.pose, self._moving_boxes(state), moves, weather,
+                                    [int(state.seed), int(state.frame)])
         route_m = state.route_m[max(int(state.progress) - 20, 0):int(state.progress) + 60]
         return {**seen, "route_map": renderer.draw_route(route_m, state.pose),
                 "speed_mps": np.float32(state.speed_mps), "reward": np.float32(self.reward(state)),
@@ -245,6 +248,7 @@ class Town:
                    for things in (self._solid.take(near), moving.take(moving.material != box_lib.SHADOW)))
 
     def _moving_boxes(self, state: TownState) -> box_lib.Boxes:
+        """Bodies, cabins and shadows of all cars, then bodies and heads of all pedestrians."""
         traffic = state.traffic
         cars_m, car_yaw_rad = traffic_lib.car_poses(self.streets, traffic)
         people_m, person_yaw_rad = traffic_lib.person_poses(traffic)

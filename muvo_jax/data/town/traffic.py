@@ -23,6 +23,7 @@ CAR_FRONT_M = 2.3
 CLAIM_M = 16.0
 WALK_OFFSET_M = 6.8
 WAIT_S = (2.0, 9.0)
+MOVING_MPS = 0.2  # a car that is slower stands still to the eye
 
 
 @flax.struct.dataclass
@@ -96,6 +97,11 @@ def person_poses(traffic: Traffic) -> tuple[np.ndarray, np.ndarray]:
     facing = line * traffic.walk_direction[:, None]
     return (traffic.walk_from_m + line * (traffic.walked_m / length_m)[:, None],
             np.arctan2(facing[:, 1], facing[:, 0]))
+
+
+def moving(traffic: Traffic) -> tuple[np.ndarray, np.ndarray]:
+    """Which cars [M] and which pedestrians [P] are on the move, bool: not those that stand in a queue or wait."""
+    return traffic.speed_mps > MOVING_MPS, ~(traffic.crosses & _at_end(traffic))
 
 
 def obstacles(streets: map_lib.Streets, traffic: Traffic, ego_middle_m: np.ndarray,

@@ -16,7 +16,7 @@ import numpy as np
 from muvo_jax import types
 from muvo_jax.interop.parity import cases, drawing
 from muvo_jax.metrics import image as image_metrics
-from muvo_jax.metrics import occupancy, points
+from muvo_jax.metrics import occupancy, points, streaming
 from muvo_jax.model import camera
 from muvo_jax.nn import resnet
 from muvo_jax.objectives import classification, kl, perceptual, regression, scal, similarity
@@ -255,11 +255,12 @@ def class_scores(context: cases.Context) -> Checks:
 def _binary_scores(prediction: np.ndarray, truths: list[np.ndarray],
                    chosen: Sequence[int]) -> dict[str, float]:
     """Scores of occupancy over batches [N, *grid] of one prediction, where the classes `chosen` count as occupied."""
-    counts = occupancy.OccupancyCounts.zeros(1)
+    sums = streaming.DriveSums()
     for truth in truths:
         target = np.where(truth == IGNORED, IGNORED, np.isin(truth, chosen))
-        counts = counts.add(np.isin(prediction, chosen)[:, None], target[:, None], unknown_is_empty=False)
-    return {name: float(value[0]) for name, value in counts.scores().items()}
+        counted = occupancy.counts(np.isin(prediction, chosen)[:, None], target[:, None], unknown_is_empty=False)
+        sums.add(("",) * len(truth), counted)
+    return {name: float(score(sums.total())[0]) for name, score in occupancy.SCORES.items()}
 
 
 def perceptual_distances(context: cases.Context) -> Checks:

@@ -1,0 +1,170 @@
+"""What evaluate reports: tables for the screen, RUN/report.md and RUN/evaluation.json."""
+
+from __future__ import annotations
+
+import json
+import math
+import pathlib
+from collections.abc import Mapping
+from typing import Any
+
+import rich.table
+
+from muvo_jax.metrics import occupancy, protocol
+
+# metric -> (label, decimals, whether higher is better)
+METRICS = {
+    "psnr_db": ("PSNR (dB)", 2, True), "psnr_movers_db": ("PSNR of movers (dB)", 2, True),
+    "chamfer_m": ("Chamfer (m)", 3, False), "chamfer_above_m": ("Chamfer above the road (m)", 3, False),
+    "iou_occ_above_observed": ("IoU+ above the road", 4, True),
+    "iou_occ_above_all": ("IoU+ above the road, unknown = empty", 4, True),
+    "iou_occ_movers": ("IoU+ of movers", 4, True),
+    "iou_occ_observed": ("IoU+", 4, True), "iou_empty_observed": ("IoU-", 4, True),
+    "precision_observed": ("precision", 4, True), "recall_observed": ("recall", 4, True),
+    "iou_occ_all": ("IoU+, unknown = empty", 4, True), "iou_empty_all": ("IoU-, unknown = empty", 4, True),
+    "precision_all": ("precision, unknown = empty", 4, True), "recall_all": ("recall, unknown = empty", 4, True),
+    "depth_error_m": ("depth error (m)", 2, False), "semantic_image_share": ("semantic image, share right", 4, True),
+    "semantic_range_view_share": ("semantic range view, share right", 4, True),
+    "birds_eye_share": ("bird's-eye view, share right", 4, True),
+}
+SOURCES = {"model": "model", "copy_last": "copy-last", "warp_last": "warp-last", "warp_fused": "warp-fused",
+           "training_mean": "training mean"}
+HEADS = {"image": "image", "range_view": "range", "occupancy": "voxels above the road"}
+STEP_METRICS = ("psnr_db", "chamfer_m", "iou_occ_above_observed", "iou_occ_observed", "iou_occ_all", "iou_occ_movers")
+
+
+def screen_table(split: str, phase: str, scores: Mapping[str, Any]) -> rich.table.Table:
+    """One split and phase: a row for each metric, the best source bold."""
+    phase_scores = scores[phase]
+    title = f"{split}: {phase} frames, {scores['windows']} windows of {scores['drives']} drives"
+    table = rich.table.Table(title=title, title_justify="left")
+    table.add_column("metric")
+    for source in phase_scores:
+        table.add_column(SOURCES[source], justify="right")
+    table.add_column("model,\n95 %", justify="right")
+    if phase == "imagined":
+        steps = max(len(metric["per_step"]) for metric in phase_scores["model"].values())
+        for source in phase_scores:
+            table.add_column(f"{SOURCES[source]}\nat step {steps}", justify="right")
+    table.add_column("undefined\nframes", justify="right")
+    for name, (label, decimals, higher) in METRICS.items():
+        if name not in phase_scores["model"]:
+            continue
+        means = {source: metrics[name]["mean"] for source, metrics in phase_scores.items() if name in metrics}
+        cells = marked(means, phase_scores, decimals, higher, "[bold]{}[/bold]")
+        cells.append(interval_text(phase_scores["model"][name], decimals))
+        if phase == "imagined":
+            last = {source: metrics[name]["per_step"][-1]
+                    for source, metrics in phase_scores.items() if name in metrics}
+            cells += marked(last, phase_scores, decimals, higher, "[bold]{}[/bold]")
+        undefined = [str(metrics[name].get("undefined", "")) for metrics in phase_scores.values() if name in metrics]
+        table.add_row(label, *cells, " / ".join(part for part in undefined if part))
+    return table
+
+
+def marked(values: Mapping[str, float], sources: Mapping[str, Any], decimals: int, higher: bool,
+           mark: str) -> list[str]:
+    """The values as text, the best one marked; NaN stays nan, a source without the metric is empty."""
+    defined = [value for value in values.values() if not math.isnan(value)]
+    best = (max if higher else min)(defined) if defined else None
+    cells = []
+    for source in sources:
+        text = "" if source not in values else number(values[source], decimals)
+        cells.append(mark.format(text) if text and values[source] == best else text)
+    return cells
+
+
+def number(value: float, decimals: int) -> str:
+    return "nan" if math.isnan(value) else f"{value:.{decimals}f}"
+
+
+def interval_text(metric: Mapping[str, Any], decimals: int) -> str:
+    """Such as "19.31..20.85"; empty where a split has one drive."""
+    low, high = metric["interval"]
+    return "" if math.isnan(low) else f"{number(low, decimals)}..{number(high, decimals)}"
+
+
+def answers_line(ratios: Mapping[str, Any]) -> str:
+    """The action shuffle ratios of the heads for the screen."""
+    shown = ", ".join(f"{HEADS[head]} {number(ratio['mean'], 2)}" for head, ratio in ratios.items())
+    return f"error under another window's actions over error under the recorded ones (1 is deaf): {shown or 'none'}"
+
+
+def write_report(folder: pathlib.Path, report: Mapping[str, Any], suffix: str = "") -> tuple[pathlib.Path, ...]:
+    """Writes RUN/evaluation.json (not-a-number as the string "nan") and RUN/report.md; returns their paths."""
+    numbers, page = folder / f"evaluation{suffix}.json", folder / f"report{suffix}.md"
+    numbers.write_text(json.dumps(json_ready(report), indent=1) + "\n", encoding="utf-8")
+    page.write_text(markdown(report), encoding="utf-8")
+    return numbers, page
+
+
+def json_ready(value):
+    """Strict JSON: floats that are not finite become strings."""
+    if isinstance(value, Mapping):
+        return {name: json_ready(item) for name, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [json_ready(item) for item in value]
+    return str(value) if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def markdown(report: Mapping[str, Any]) -> str:
+    """The report as a page: for each split the averages and every step of the horizon."""
+    lines = [f"# {pathlib.Path(report['run']).name}", "",
+             f"{report['variant']}, {report['parameters']:,} parameters, step {report['step']}, trained and judged on "
+             f"{report['data']['name']}.", "", f"Protocol: {report['protocol']}. Training mean of "
+             f"{report['training_mean_frames']} frames. Bold is best. Chamfer and PSNR are means over frames; voxel "
+             f"scores and movers' PSNR come from sums over the whole split. In brackets 95 % intervals by bootstrap "
+             f"over drives. Above the road: {occupancy.ABOVE_ROAD_M:g} m and more over the ground under the ego.", ""]
+    for split, scores in report["splits"].items():
+        lines += [f"## {split} ({scores['windows']} windows of {scores['drives']} drives)", ""]
+        for phase in protocol.PHASES:
+            lines += [f"### {phase} frames", "", *_average_table(scores[phase]), ""]
+        lines += ["### imagined frames, step by step", "", *_step_table(scores["imagined"]), "",
+                  "### answer to actions", "", *_answer_table(scores["action_shuffle"]), "",
+                  f"Movers: {scores['movers'] or 'none'}. Copy-last copied {scores['copy_last_unknown_voxels']} "
+                  f"unknown voxels as empty.", ""]
+    return "\n".join(lines)
+
+
+def _average_table(phase_scores: Mapping[str, Any]) -> list[str]:
+    lines = ["| metric | " + " | ".join(SOURCES[source] for source in phase_scores) + " | frames (undefined) |",
+             "|---|" + "---:|" * (len(phase_scores) + 1)]
+    for name, (label, decimals, higher) in METRICS.items():
+        if name not in phase_scores["model"]:
+            continue
+        means = {source: metrics[name]["mean"] for source, metrics in phase_scores.items() if name in metrics}
+        counted = [f"{metrics[name]['frames']} ({metrics[name]['undefined']})" for metrics in phase_scores.values()
+                   if "frames" in metrics.get(name, {})]
+        cells = marked(means, phase_scores, decimals, higher, "**{}**")
+        intervals = [interval_text(metrics[name], decimals) if name in metrics else ""
+                     for metrics in phase_scores.values()]
+        cells = [f"{cell} [{interval}]" if interval else cell for cell, interval in zip(cells, intervals, strict=True)]
+        lines.append(f"| {label} | " + " | ".join(cells) + f" | {', '.join(counted)} |")
+    return lines
+
+
+def _step_table(phase_scores: Mapping[str, Any]) -> list[str]:
+    steps = len(next(iter(phase_scores["model"].values()))["per_step"])
+    lines = ["| metric | source | " + " | ".join(str(step + 1) for step in range(steps)) + " |",
+             "|---|---|" + "---:|" * steps]
+    for name in STEP_METRICS:
+        for source, metrics in phase_scores.items():
+            if name in metrics:
+                label, decimals, _ = METRICS[name]
+                cells = " | ".join(number(value, decimals) for value in metrics[name]["per_step"])
+                lines.append(f"| {label} | {SOURCES[source]} | {cells} |")
+    return lines
+
+
+def _answer_table(ratios: Mapping[str, Any]) -> list[str]:
+    steps = max((len(ratio["per_step"]) for ratio in ratios.values()), default=0)
+    lines = ["Error of imagined frames under another window's actions over the error under the recorded ones; 1 is "
+             "deaf to actions.", "",
+             "| head | ratio | " + " | ".join(str(step + 1) for step in range(steps)) + " |",
+             "|---|" + "---:|" * (steps + 1)]
+    for head, ratio in ratios.items():
+        interval = interval_text(ratio, 2)
+        mean = number(ratio["mean"], 2) + (f" [{interval}]" if interval else "")
+        cells = [mean, *(number(value, 2) for value in ratio["per_step"])]
+        lines.append(f"| {HEADS[head]} | " + " | ".join(cells) + " |")
+    return lines

@@ -1,0 +1,59 @@
+"""Does a model answer to the actions of a recording: its error under another window's actions over its own error.
+
+1 says that it is deaf to them. The pasts stay the same, so that only what the actions change can tell the two apart.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from muvo_jax import config as config_lib
+from muvo_jax import types
+from muvo_jax.metrics import occupancy, streaming
+
+
+def errors(prediction: Mapping[str, np.ndarray], truth: types.Batch,
+           grid: config_lib.VoxelGrid) -> dict[str, np.ndarray]:
+    """Head -> error of each frame, float64 [B, H].
+
+    Squared error of the image; absolute error of the range where the recording has a return, m; of the known voxels
+    above the road how many are decided wrongly.
+    """
+    found: dict[str, np.ndarray] = {}
+    if "image" in prediction and truth.image is not None:
+        target = np.asarray(truth.image, np.float32) / 255.0
+        found["image"] = np.square(prediction["image"] - target).mean(axis=(2, 3, 4), dtype=np.float64)
+    if "range_view" in prediction and truth.range_view is not None:
+        target = np.asarray(truth.range_view)[..., 3]
+        gap_m = np.abs(np.asarray(prediction["range_view"])[..., 3] - target)
+        found["range_view"] = np.where(target > 0.0, gap_m, 0.0).sum(axis=(2, 3), dtype=np.float64)
+    if "occupancy" in prediction and truth.occupancy is not None:
+        above = occupancy.above_road(grid)
+        counted = occupancy.counts(prediction["occupancy"][..., above], np.asarray(truth.occupancy)[..., above],
+                                   unknown_is_empty=False)
+        found["occupancy"] = counted["false_positive"] + counted["false_negative"]
+    return found
+
+
+class Answers:
+    """Errors of a model under the recorded actions and under others."""
+
+    def __init__(self, config: config_lib.Config):
+        self._grid, self._seed = config.model.voxels, config.evaluation.seed
+        self._sums: dict[str, streaming.DriveSums] = {}
+
+    def add(self, recorded: Mapping[str, np.ndarray], other: Mapping[str, np.ndarray], truth: types.Batch,
+            drives: Sequence[str]) -> None:
+        """With imagined frames [B, H, ...] under the recorded and under other actions, and what was recorded."""
+        under_recorded, under_other = (errors(frames, truth, self._grid) for frames in (recorded, other))
+        for head, error in under_recorded.items():
+            self._sums.setdefault(head, streaming.DriveSums()).add(
+                drives, {"recorded": error, "other": under_other[head]})
+
+    def ratios(self) -> dict[str, dict[str, Any]]:
+        """{head: {"mean", "interval", "per_step"}} of the action shuffle ratio, NaN where nothing is wrong at all."""
+        ratio = lambda sums: streaming.divide_or_nan(sums["other"], sums["recorded"])
+        return {head: streaming.summary(sums, ratio, self._seed) for head, sums in self._sums.items()}

@@ -1,0 +1,37 @@
+"""One number for how good imagined frames are, by which a run's best checkpoint is chosen.
+
+A skill is 1 - error / error of a reference: 1 is perfect, 0 as good as the reference, below 0 worse. The reference is
+the last observed frame as the motion of the car moves it, or as it is where that motion is unknown. The score is the
+mean skill of what is imagined: squared error of the image (by its mean PSNR), Chamfer distance of the returns, and
+1 - IoU+ above the road.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+REFERENCES = ("warp_last", "copy_last")  # the first that was judged
+_ERRORS = {"psnr_db": lambda decibels: 10.0 ** (-decibels / 10.0), "chamfer_m": lambda metres: metres,
+           "iou_occ_above_observed": lambda share: 1.0 - share}
+STATED = ("mean over the validation splits of 1 - error / error of the moved last frame, over image, points and voxels "
+          "above the road, of imagined frames")
+
+
+def skill(imagined: Mapping[str, Mapping[str, Any]]) -> float:
+    """The score of one split, NaN where nothing can be compared.
+
+    Args:
+      imagined: source -> metric -> {"mean"}, as protocol.evaluate reports it.
+    """
+    reference = next((name for name in REFERENCES if name in imagined), None)
+    if reference is None:
+        return math.nan
+    found = []
+    for metric, error in _ERRORS.items():
+        pair = [imagined[source].get(metric, {}).get("mean", math.nan) for source in ("model", reference)]
+        ours, theirs = map(error, pair)
+        if math.isfinite(ours) and math.isfinite(theirs) and theirs > 0.0:
+            found.append(1.0 - ours / theirs)
+    return sum(found) / len(found) if found else math.nan

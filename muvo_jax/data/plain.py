@@ -103,7 +103,7 @@ class PlainRecording:
         frame_id = int(columns["frame_id"][position])
         frame: schema.RawFrame = {
             "speed_mps": np.float32(columns["speed_mps"][position]),
-            "action": np.array([columns["acceleration"][position], columns["steering"][position]], np.float32),
+            "action": self.action(sequence, index),
             "timestamp_s": np.float64(columns["timestamp_s"][position]),
             "frame_id": np.int64(frame_id),
         }
@@ -135,6 +135,11 @@ class PlainRecording:
             _check_shape(frame["route_map"], (64, 64), paths["route_map"])
         self._read_labels(frame, paths)
         return frame
+
+    def action(self, sequence: schema.Sequence, index: int) -> np.ndarray:
+        """See schema.Recording."""
+        columns = self._runs[sequence.name].columns
+        return np.array([columns[name][sequence.start + index] for name in ("acceleration", "steering")], np.float32)
 
     def _read_labels(self, frame: schema.RawFrame, paths: dict[str, pathlib.Path]) -> None:
         """Adds what was asked for of schema.LABELS."""

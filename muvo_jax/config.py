@@ -42,6 +42,8 @@ class ActionContract:
     Attributes:
       kinematics: "bicycle" where acceleration, steering and wheelbase describe the motion, else "none".
       source: "recorded" where the vehicle logged its actions, "derived" where they were computed from its motion.
+      step_action: what stands for the recorded actions of a step of data.stride frames: their "mean", or the "first",
+        as the reference takes it. A setting of the run; recordings say nothing of it.
     """
 
     accel_full_mps2: float = 3.0
@@ -51,6 +53,7 @@ class ActionContract:
     rate_hz: float = 10.0
     kinematics: Literal["bicycle", "none"] = "bicycle"
     source: Literal["recorded", "derived"] = "recorded"
+    step_action: Literal["mean", "first"] = "mean"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -382,7 +385,11 @@ class Config:
     def from_dict(cls, values: dict[str, Any]) -> Config:
         """Rebuilds a config from `to_dict` or parsed JSON.
 
+        A contract that says nothing of step_action is of a run from before there was a choice: it took the first.
+
         Raises:
           ValueError: for an unknown field (naming the nearest known one) or a value of the wrong type.
         """
+        if isinstance(values, dict) and isinstance(values.get("contract"), dict):
+            values = values | {"contract": {"step_action": "first"} | values["contract"]}
         return parse(cls, values, "config")

@@ -7,10 +7,14 @@ import dataclasses
 
 @dataclasses.dataclass(frozen=True)
 class AugmentationConfig:
-    """Random changes of the model's inputs in training, never of a target. The numbers are the reference's.
+    """Random changes of training windows: of the model's inputs, never of a target, but for `mirror`.
+
+    The numbers are the reference's, which has no mirror.
 
     Attributes:
       image, route: whether images and route maps are changed at all.
+      mirror: exchange left and right of every second window, drawn anew each time: in all of its fields, inputs,
+        actions and targets alike. For sensors that are symmetric about the middle of the car and look ahead.
       blur, sharpen: probability that a frame is blurred, or else sharpened.
       blur_std_px: of the Gaussian, over a window of 5 pixels.
       sharpen_factor: 0 is a smoothed image, 1 the image itself.
@@ -27,6 +31,7 @@ class AugmentationConfig:
 
     image: bool = False
     route: bool = False
+    mirror: bool = False
     blur: float = 0.3
     sharpen: float = 0.3
     blur_std_px: tuple[float, float] = (0.1, 1.7)

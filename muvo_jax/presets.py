@@ -104,8 +104,9 @@ def tiny() -> config_lib.Config:
     )
 
 
-# The authors train with changed images and routes.
+# The authors train with changed images and routes, and keep one of the actions of a step.
 _AUGMENTED = config_lib.AugmentationConfig(image=True, route=True)
+_CONTRACT = config_lib.ActionContract(step_action="first")
 
 
 def paper() -> config_lib.Config:
@@ -115,6 +116,7 @@ def paper() -> config_lib.Config:
         model=config_lib.ModelConfig(heads=("image", "range_view", "action")),
         optimizer=config_lib.OptimizerConfig(accumulate=16),
         augmentation=_AUGMENTED,
+        contract=_CONTRACT,
     )
 
 
@@ -127,6 +129,7 @@ def paper_occupancy() -> config_lib.Config:
         preset="paper-occupancy",
         optimizer=config_lib.OptimizerConfig(accumulate=16),
         augmentation=_AUGMENTED,
+        contract=_CONTRACT,
         data=config_lib.DataConfig(frames=6, context=4, horizon=2, town_size="tiny"),
     )
 
@@ -139,6 +142,7 @@ def _reference(preset: str, loss: config_lib.LossConfig, **model) -> config_lib.
         loss=dataclasses.replace(loss, occupancy_unknown="empty"),
         optimizer=config_lib.OptimizerConfig(accumulate=16),
         augmentation=_AUGMENTED,
+        contract=_CONTRACT,
         data=config_lib.DataConfig(frames=6, context=6, horizon=10, town_size="tiny"),
         train=config_lib.TrainConfig(steps=100_000),
     )

@@ -42,7 +42,8 @@ class Batch(_Indexable):
     A modality that the recording lacks is None, never a zero array.
 
     Attributes:
-      action: float32 [B, T, 2], (acceleration, steering), each in [-1, 1]; steering > 0 is right.
+      action: float32 [B, T, 2], (acceleration, steering), each in [-1, 1]; steering > 0 is right. Where a step spans
+        several recorded frames, the mean of theirs or the first, as config.ActionContract.step_action says.
       is_first: bool [B, T], true at the first step of a window and wherever a recording restarts.
       image: uint8 [B, T, H, W, 3], RGB.
       range_view: float32 [B, T, Hr, Wr, 4], x, y, z (ego frame, m) and range from the lidar (m);

@@ -49,6 +49,16 @@ def test_bad_values_are_refused_with_the_reason(field, value, message):
         config_lib.override(town, field, value)
 
 
+def test_a_kept_run_that_says_nothing_of_steps_goes_on_taking_the_first_action():
+    kept = presets.get("town").to_dict()
+    assert kept["contract"].pop("step_action") == "mean"
+    assert config_lib.Config.from_dict(kept).contract.step_action == "first"
+    assert config_lib.Config.from_dict({"preset": "mine"}).contract.step_action == "mean"
+    assert {name: presets.get(name).contract.step_action for name in presets.PRESETS} == {
+        "town": "mean", "tiny": "mean", "paper": "first", "paper-occupancy": "first", "reference-1d": "first",
+        "reference-2d": "first", "reference-mobilevit": "first"}
+
+
 def test_unknown_preset_names_its_neighbour():
     with pytest.raises(ValueError, match="Did you mean paper-occupancy"):
         presets.get("paper-ocupancy")

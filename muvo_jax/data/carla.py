@@ -105,7 +105,7 @@ class CarlaRecording:
         run, row = self._runs[sequence.name], sequence.start + index
         described = self.description
         frame: schema.RawFrame = {
-            "action": self._actions[run.name][row], "speed_mps": self._speeds[run.name][row],
+            "action": self.action(sequence, index), "speed_mps": self._speeds[run.name][row],
             "reward": self._rewards[run.name][row], "is_terminal": np.bool_(False),
             "timestamp_s": np.float64(row / described.rate_hz), "frame_id": np.int64(row),
         }
@@ -133,6 +133,10 @@ class CarlaRecording:
         if "route_map" in paths:
             frame["route_map"] = _nearest(carla_files.read_route_map(paths["route_map"]), _ROUTE_PX)
         return frame | carla_files.read_labels(paths, described.voxels or VOXELS)
+
+    def action(self, sequence: schema.Sequence, index: int) -> np.ndarray:
+        """See schema.Recording."""
+        return self._actions[sequence.name][sequence.start + index]
 
 
 def occupancy_name(row: int) -> str:

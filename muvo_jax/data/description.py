@@ -2,14 +2,26 @@
 
 from __future__ import annotations
 
+import dataclasses
 import pathlib
 from collections.abc import Callable
+from typing import Any
 
 from muvo_jax import config as config_lib
 from muvo_jax.data import schema
 
 _SECTIONS: dict[str, Callable] = {"camera": schema.Camera, "lidar": config_lib.RangeViewGeometry,
                                   "voxels": config_lib.VoxelGrid, "action": config_lib.ActionContract}
+
+
+def tables(**sections) -> dict[str, dict[str, Any]]:
+    """The sections of a description as `section` reads them: name -> fields; those that are None are left out.
+
+    How windows are cut (step_action) is a run's to say, not a recording's.
+    """
+    found = {name: dataclasses.asdict(value) for name, value in sections.items() if value is not None}
+    found.get("action", {}).pop("step_action", None)
+    return found
 
 
 def field(header: dict, name: str, kind: type | tuple[type, ...], path: pathlib.Path):
@@ -46,6 +58,9 @@ def section(header: dict, name: str, path: pathlib.Path, *, required: bool):
         if required:
             raise schema.DataError(f"{path}: section [{name}] is missing, although there is data that needs it.")
         return None
+    if name == "action" and isinstance(header[name], dict) and "step_action" in header[name]:
+        raise schema.DataError(f"{path}: action.step_action says how windows are cut, not how actions were recorded. "
+                               f"Take it out, and train with --set contract.step_action={header[name]['step_action']}.")
     try:
         value = config_lib.parse(_SECTIONS[name], header[name], f"{path}: {name}")
     except (TypeError, ValueError) as error:

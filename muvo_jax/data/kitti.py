@@ -155,6 +155,13 @@ class KittiRecording:
             frame["points_m"] = read_scan(paths["velodyne_points"])
         return frame
 
+    def action(self, sequence: schema.Sequence, index: int) -> np.ndarray:
+        """See schema.Recording."""
+        drive = self._drives[sequence.name]
+        frame_id = int(drive.frame_ids[sequence.start + index])
+        motion = read_oxts(drive.folder / "oxts" / "data" / f"{frame_id:010d}{self._sensors['oxts']}")
+        return derive_action(*motion, self.description.contract)
+
 
 def _has(folder: pathlib.Path, sensor: str, suffix: str) -> bool:
     return bool(files.numbered(folder / sensor / "data", suffix))

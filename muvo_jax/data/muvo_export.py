@@ -13,17 +13,25 @@ depth and lidar afterwards. Nothing here needs pandas.
 from __future__ import annotations
 
 import csv
-import dataclasses
 import io
 import pathlib
 import shutil
 from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 from PIL import Image
 
-from muvo_jax.data import carla, carla_files, carla_runs, files, frame_pickle, plain, recorder, schema
+from muvo_jax.data import (
+    carla,
+    carla_files,
+    carla_runs,
+    description,
+    files,
+    frame_pickle,
+    plain,
+    recorder,
+    schema,
+)
 
 # What the town's classes are in CARLA's tags (town/boxes.py: sky, road, marking, pavement, grass, building, ...).
 TOWN_TAGS = np.array([13, 7, 6, 8, 22, 1, 9, 5, 10, 4], np.uint8)
@@ -83,11 +91,10 @@ def _check(recording: plain.PlainRecording, source: pathlib.Path) -> None:
 
 
 def _describe(described: schema.RecordingDescription, out: pathlib.Path) -> None:
-    tables: dict[str, Any] = {"camera": described.camera, "lidar": described.lidar, "action": described.contract}
-    if described.voxels == carla.VOXELS:
-        tables["voxels"] = described.voxels
+    voxels = described.voxels if described.voxels == carla.VOXELS else None
     text = recorder.to_toml({"rate_hz": described.rate_hz},
-                            {name: dataclasses.asdict(value) for name, value in tables.items() if value is not None})
+                            description.tables(camera=described.camera, lidar=described.lidar,
+                                               action=described.contract, voxels=voxels))
     path = out / carla.SENSORS_FILE
     if path.is_file() and path.read_text(encoding="utf-8") != text:
         raise FileExistsError(f"{path} describes other sensors; choose another folder or remove this one.")

@@ -39,6 +39,7 @@ class Frames:
         self.recording = recording
         self.config = config
         self.cache = windows_lib.FrameCache(int(config.data.cache_gib * 2**30))
+        self._actions = windows_lib.StepActions(recording)
 
     def get(self, sequence: schema.Sequence, index: int) -> prepare.PreparedFrame:
         """Frame `index` of `sequence`; called from several threads at once."""
@@ -67,6 +68,8 @@ class Frames:
                 for step, frame in enumerate(row):
                     values[index, step] = frame[name]
             fields[name] = values
+        if self.config.contract.step_action == "mean":
+            fields["action"] = self.actions(windows)
         if "ego_motion" in fields:
             fields["ego_motion"] = ego_motion.between(fields["ego_motion"])
         is_first = np.zeros(fields["action"].shape[:2], bool)
@@ -75,6 +78,8 @@ class Frames:
 
     def actions(self, windows: Sequence[windows_lib.Window]) -> np.ndarray:
         """Their actions, float32 [B, T, 2]."""
+        if self.config.contract.step_action == "mean":
+            return np.stack([self._actions.mean(window) for window in windows])
         return np.stack([np.stack([self.get(window.sequence, index)["action"] for index in window.indices])
                          for window in windows])
 

@@ -106,7 +106,7 @@ class PlainRecording:
         frame_id = int(columns["frame_id"][position])
         frame: schema.RawFrame = {
             "speed_mps": np.float32(columns["speed_mps"][position]),
-            "action": np.array([columns["acceleration"][position], columns["steering"][position]], np.float32),
+            "action": self.action(sequence, index),
             "timestamp_s": np.float64(columns["timestamp_s"][position]),
             "frame_id": np.int64(frame_id),
         }
@@ -150,6 +150,11 @@ class PlainRecording:
             place = paths["occupancy_moving_mask"]
             frame["occupancy_moving_mask"] = files.read_npz(place, "occupancy_moving_mask").astype(bool, copy=False)
             _check_shape(frame["occupancy_moving_mask"], described.voxels.shape, place)
+
+    def action(self, sequence: schema.Sequence, index: int) -> np.ndarray:
+        """See schema.Recording."""
+        columns = self._runs[sequence.name].columns
+        return np.array([columns[name][sequence.start + index] for name in ("acceleration", "steering")], np.float32)
 
     def _read_labels(self, frame: schema.RawFrame, paths: dict[str, pathlib.Path]) -> None:
         """Adds what was asked for of schema.LABELS."""

@@ -66,7 +66,8 @@ def adapt(config: config_lib.Config, recording: schema.Recording, *, keep: Colle
     notes: list[str] = []
     model = _fit_model(config.model, description, notes)
     data = _fit_windows(config.data, recording, keep, notes)
-    return Adapted(dataclasses.replace(config, model=model, data=data, contract=description.contract), tuple(notes))
+    contract = dataclasses.replace(description.contract, step_action=config.contract.step_action)
+    return Adapted(dataclasses.replace(config, model=model, data=data, contract=contract), tuple(notes))
 
 
 def prepare_frame(raw: schema.RawFrame, config: config_lib.Config) -> PreparedFrame:

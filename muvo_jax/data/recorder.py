@@ -8,7 +8,6 @@ reads, depth maps (16-bit PNG, centimetres, 65535 in the sky) and class images a
 from __future__ import annotations
 
 import csv
-import dataclasses
 import io
 import json
 import os
@@ -21,7 +20,7 @@ import numpy as np
 from PIL import Image
 
 from muvo_jax import config as config_lib
-from muvo_jax.data import plain, schema
+from muvo_jax.data import description, plain, schema
 
 COLUMNS = ("frame_id", "timestamp_s", "x_m", "y_m", "yaw_rad", "speed_mps", "acceleration", "steering", "reward",
            "is_terminal", "weather")
@@ -41,10 +40,9 @@ def write_description(root: pathlib.Path | str, *, name: str, rate_hz: float, sp
       FileExistsError: where ROOT holds a different description (runs of different settings must not be mixed).
     """
     root = pathlib.Path(root)
-    tables = {"action": contract, "camera": camera, "lidar": lidar, "voxels": voxels}
     text = to_toml({"schema_version": plain.SCHEMA_VERSION, "name": name, "rate_hz": float(rate_hz),
                     "splits": list(splits)},
-                   {key: dataclasses.asdict(value) for key, value in tables.items() if value is not None})
+                   description.tables(action=contract, camera=camera, lidar=lidar, voxels=voxels))
     path = root / plain.DESCRIPTION_FILE
     if path.exists():
         if path.read_text(encoding="utf-8") != text:

@@ -19,6 +19,7 @@ import struct
 import threading
 import warnings
 import zlib
+from collections.abc import Collection
 from typing import Any, Literal
 
 import numpy as np
@@ -70,11 +71,16 @@ def encode_frame(frame: schema.RawFrame, encoding: Encoding) -> bytes:
     return body + _LENGTH.pack(zlib.crc32(body))
 
 
-def decode_frame(record: bytes, where: str) -> schema.RawFrame:
+def decode_frame(record: bytes, where: str, only: Collection[str] | None = None) -> schema.RawFrame:
     """The inverse of `encode_frame`.
 
+    Args:
+      record: the bytes.
+      where: they lie, for messages.
+      only: the fields that are wanted; None is all.
+
     Raises:
-      DataError: for a damaged record, naming `where` it lies.
+      DataError: for a damaged record.
     """
     if len(record) < 2 * _LENGTH.size or zlib.crc32(record[:-4]) != _LENGTH.unpack(record[-4:])[0]:
         raise _damaged(where, "its checksum does not fit")
@@ -85,6 +91,8 @@ def decode_frame(record: bytes, where: str) -> schema.RawFrame:
         for field in json.loads(record[_LENGTH.size:position]):
             content = record[position:position + field["bytes"]]
             position += field["bytes"]
+            if only is not None and field["name"] not in only:
+                continue
             array = _decode(content, field["encoding"], np.dtype(field["dtype"]), tuple(field["shape"]))
             frame[field["name"]] = array if array.ndim else array[()]
     except (ValueError, KeyError, TypeError, OSError, zlib.error) as error:
@@ -139,6 +147,13 @@ class PackedRecording:
 
     def read(self, sequence: schema.Sequence, index: int) -> schema.RawFrame:
         """See schema.Recording."""
+        return self._read(sequence, index)
+
+    def action(self, sequence: schema.Sequence, index: int) -> np.ndarray:
+        """See schema.Recording."""
+        return self._read(sequence, index, ("action",))["action"]
+
+    def _read(self, sequence: schema.Sequence, index: int, only: Collection[str] | None = None) -> schema.RawFrame:
         shard, position = divmod(self._first[(sequence.name, sequence.start)] + index, self._frames_per_shard)
         where = f"{self._root / self._shards[shard]['file']}, record {position}"
         try:
@@ -146,7 +161,7 @@ class PackedRecording:
                 (record,) = self._reader(shard).read([position])
         except (RuntimeError, IndexError, ValueError) as error:
             raise _damaged(where, str(error)) from error
-        return decode_frame(record, where)
+        return decode_frame(record, where, only)
 
     def _reader(self, shard: int) -> Any:
         if shard not in self._readers:

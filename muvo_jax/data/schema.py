@@ -171,6 +171,14 @@ class Recording(Protocol):
         """
         ...
 
+    def action(self, sequence: Sequence, index: int) -> np.ndarray:
+        """Returns the action of that frame alone, float32 [2], opening as little of the frame as can be.
+
+        Raises:
+          DataError: as `read`.
+        """
+        ...
+
 
 def instance_mask(classes: np.ndarray, names: tuple[str, ...]) -> np.ndarray:
     """bool [...], where `classes`, indices into `names`, show INSTANCE_CLASSES."""

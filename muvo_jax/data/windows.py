@@ -61,6 +61,30 @@ def others(windows: tuple[Window, ...]) -> tuple[Window, ...]:
     return tuple(windows[place] for place in found)
 
 
+class StepActions:
+    """What was applied over each step of a window: the mean of the recorded actions from its frame to before the next.
+
+    Every action is read once and kept: 8 bytes a frame.
+    """
+
+    def __init__(self, recording: schema.Recording):
+        self._recording = recording
+        self._known: dict[schema.Sequence, np.ndarray] = {}  # float32 [length, 2], NaN until read
+
+    def mean(self, window: Window) -> np.ndarray:
+        """float32 [frames, 2]; the last step of a sequence that ends within it is the mean of what there is.
+
+        Safe to call from several threads. Raises DataError as schema.Recording.action.
+        """
+        sequence = window.sequence
+        known = self._known.setdefault(sequence, np.full((sequence.length, 2), np.nan, np.float32))
+        stop = min(window.indices[-1] + window.stride, sequence.length)
+        for index in range(window.start, stop):
+            if np.isnan(known[index]).any():
+                known[index] = self._recording.action(sequence, index)
+        return np.stack([known[index:min(index + window.stride, stop)].mean(axis=0) for index in window.indices])
+
+
 class FrameCache:
     """Prepared frames by key, the least recently used dropped first; safe to use from several threads.
 

@@ -21,7 +21,7 @@ from muvo_jax import types
 from muvo_jax.metrics import image as image_metrics
 from muvo_jax.model import rollout, world_model
 from muvo_jax.objectives import perceptual, total
-from muvo_jax.training import augmentation
+from muvo_jax.training import augmentation, mirror
 from muvo_jax.training import optimizer as optimizer_lib
 from muvo_jax.training import parallel as parallel_lib
 from muvo_jax.training import state as state_lib
@@ -70,7 +70,12 @@ def make_train_step(model: world_model.WorldModel, config: config_lib.Config, *,
       parallel: "auto", "pmap" or "shard_map"; by default config.train.parallel.
       devices: by default all.
       frozen: the network of the perceptual term, where that is on.
+
+    Raises:
+      ValueError: for augmentation.mirror with sensors that are not symmetric.
     """
+    if config.augmentation.mirror:
+        mirror.check(config.model)
     optimizer = optimizer_lib.make_optimizer(config.optimizer, config.train.steps)
     rate = optimizer_lib.learning_rate(config.optimizer, config.train.steps)
     gradients_of = gradient_body(model, config, frozen)
@@ -184,6 +189,8 @@ def forward(params: Any, batch_stats: Any, batch: types.Batch, keys: types.Array
     Returns:
       The total loss of the whole batch, and (metrics, new batch_stats).
     """
+    if train and config.augmentation.mirror:
+        batch = mirror.randomly(batch, keys)
     maybe_remat = jax.checkpoint if config.train.remat else lambda function: function
     variables = {"params": params, "batch_stats": batch_stats}
     seen = min(config.train.observe_frames or batch.frames, batch.frames) if train else batch.frames

@@ -58,6 +58,7 @@ def test_a_frame(run_folder):
     run = recording.run(sequence.name)
     throttle, steer, brake = run.columns["action"][13]
     np.testing.assert_array_equal(frame["action"], np.float32([throttle if throttle > 0 else -brake, steer]))
+    np.testing.assert_array_equal(recording.action(sequence, 3), frame["action"])
     assert frame["frame_id"] == 13 and frame["timestamp_s"] == pytest.approx(1.3)
     assert frame["speed_mps"] == run.columns["speed"][13][0]
     camera = recording.description.camera

@@ -65,6 +65,7 @@ def test_actions_are_derived_from_the_motion(drive):
     contract = recording.description.contract
     assert (contract.source, contract.kinematics, contract.wheelbase_m) == ("derived", "bicycle", 2.71)
     action = recording.read(recording.sequences[0], 0)["action"]
+    np.testing.assert_array_equal(recording.action(recording.sequences[0], 0), action)
     # -1.2 m/s2 of 6 is a brake of 0.2; turning right (yaw rate -0.1 at 10 m/s) is steering to the right, > 0.
     np.testing.assert_allclose(action, [-0.2, math.atan(2.71 * 0.1 / 10) / 0.6], rtol=1e-6)
     np.testing.assert_array_equal(kitti.derive_action(0.1, 99.0, 9.0, contract), [1.0, -1.0])

@@ -37,8 +37,11 @@ class MemoryRecording:
             raise schema.DataError("image/000013.png: not a readable image")
         return {"image": np.full((32, 64, 3), number, np.uint8), "intrinsics": np.eye(3, dtype=np.float32),
                 "camera_to_ego": np.eye(4, dtype=np.float32), "points_m": np.full((2, 3), 3.0, np.float32),
-                "speed_mps": np.float32(number), "action": np.array([0.1, -0.1], np.float32),
+                "speed_mps": np.float32(number), "action": self.action(sequence, index),
                 "timestamp_s": np.float64(number / 10), "frame_id": np.int64(number)}
+
+    def action(self, sequence, index):
+        return np.array([(sequence.start + index) / 32, -0.125], np.float32)
 
 
 def frames_of(*sequences, **data):
@@ -66,6 +69,35 @@ def test_a_batch_is_valid_and_lacks_what_the_recording_lacks():
     np.testing.assert_array_equal(batch.is_first, [[True, False, False, False]] * 2)
     np.testing.assert_array_equal(batch.image[:, :, 0, 0, 0], batch.speed_mps)
     np.testing.assert_array_equal(np.diff(batch.speed_mps, axis=1), 2)  # the stride
+
+
+def test_the_action_of_a_step_is_the_mean_of_what_was_applied_over_it():
+    window = lambda frames, start: windows.Window(frames.recording.sequences[0], start, 4, 3)
+    frames = frames_of(frames=4, stride=3)  # action k is k / 32
+    assert frames.config.contract.step_action == "mean"
+    actions = frames.batch([window(frames, 0), window(frames, 2)]).action
+    np.testing.assert_array_equal(actions[0, :, 0] * 32, [(0 + 1 + 2) / 3, (3 + 4 + 5) / 3, (6 + 7 + 8) / 3, 10])
+    # The sequence ends with frame 11, where the last step of this window begins.
+    np.testing.assert_array_equal(actions[1, :, 0] * 32, [3, 6, 9, 11])
+    np.testing.assert_array_equal(actions[..., 1], -0.125)
+
+
+def test_the_first_action_stands_for_a_step_where_the_contract_says_so_and_every_one_at_stride_1():
+    frames = frames_of(frames=4, stride=3)
+    config = frames.config
+    frames = pipeline.Frames(frames.recording, dataclasses.replace(
+        config, contract=dataclasses.replace(config.contract, step_action="first")))
+    sequence = frames.recording.sequences[0]
+    np.testing.assert_array_equal(frames.batch([windows.Window(sequence, 1, 4, 3)]).action[0, :, 0] * 32, [1, 4, 7, 10])
+    both = [frames_of(frames=4, stride=1), frames]
+    one, other = (made.batch([windows.Window(sequence, 5, 4, 1)]).action for made in both)
+    np.testing.assert_array_equal(one, other)
+
+
+def test_adapting_to_a_recording_keeps_what_the_run_says_of_steps():
+    frames = frames_of()
+    config = dataclasses.replace(frames.config, contract=config_lib.ActionContract(step_action="first"))
+    assert prepare.adapt(config, frames.recording).config.contract.step_action == "first"
 
 
 @settings(max_examples=50, deadline=None)

@@ -28,6 +28,7 @@ def test_description_and_frames(tmp_path):
     assert (frame["image"] == 5).all() and frame["image"].shape == (32, 64, 3)
     assert (frame["route_map"] == 5).all() and (frame["points_m"] == 7).all()
     np.testing.assert_array_equal(frame["action"], np.float32([0.25, -0.5]))
+    np.testing.assert_array_equal(recording.action(recording.sequences[1], 5), frame["action"])
     assert frame["speed_mps"] == 5.5 and frame["reward"] == 1.0 and bool(frame["is_terminal"])
     assert frame["frame_id"] == 5 and frame["timestamp_s"] == pytest.approx(0.5)
 
@@ -84,6 +85,14 @@ def test_absent_modalities_are_absent(tmp_path):
 def test_a_description_that_cannot_be_used(tmp_path, header, message):
     with pytest.raises(schema.DataError, match=message):
         plain.PlainRecording(writers.write_plain(tmp_path, {"train/a": 2}, **header))
+
+
+def test_how_windows_are_cut_is_no_matter_of_the_recording(tmp_path):
+    path = writers.write_plain(tmp_path) / "recording.toml"
+    assert "step_action" not in path.read_text()
+    path.write_text(path.read_text().replace("[action]\n", '[action]\nstep_action = "first"\n'))
+    with pytest.raises(schema.DataError, match=r"train with --set contract\.step_action=first"):
+        plain.PlainRecording(tmp_path)
 
 
 def test_a_missing_section_is_named(tmp_path):

@@ -48,6 +48,8 @@ def test_every_frame_and_the_description_come_back(source, packed):
         assert getattr(after.description, name) == getattr(before.description, name)
     for left, right in zip(frames_of(before), frames_of(after), strict=True):
         assert_same(left, right)
+    last = after.sequences[-1]
+    np.testing.assert_array_equal(after.action(last, 3), before.action(last, 3))
 
 
 def test_machines_share_the_shards(source, packed, tmp_path):

@@ -57,8 +57,11 @@ class MemoryRecording:
                 "camera_to_ego": np.float32(camera.camera_to_ego),
                 "points_m": random.uniform(-20.0, 20.0, (50, 3)).astype(np.float32),
                 "route_map": np.zeros((64, 64), np.uint8), "speed_mps": np.float32(3.0),
-                "action": random.uniform(-1.0, 1.0, 2).astype(np.float32),
+                "action": self.action(sequence, index),
                 "timestamp_s": np.float64(index / 10), "frame_id": np.int64(index)}
+
+    def action(self, sequence, index):
+        return np.random.default_rng([len(sequence.split), index, 1]).uniform(-1.0, 1.0, 2).astype(np.float32)
 
 
 class Interrupting(screen.Screen):

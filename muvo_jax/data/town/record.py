@@ -88,6 +88,7 @@ def fingerprint(town_config: settings.TownConfig, size: str) -> str:
     splits = {name: dataclasses.asdict(split) for name, split in settings.SIZES[size].items()}
     weathers = {name: dataclasses.asdict(weather) for name, weather in settings.WEATHERS.items()}
     town = dataclasses.asdict(town_config)
+    del town["contract"]["step_action"]  # the same recording either way
     if not town_config.labels:
         del town["labels"]  # a recording without them is named as it was before there were any
     content = json.dumps([RECORDING_VERSION, WARM_UP_FRAMES, town, splits, weathers], sort_keys=True)

@@ -10,6 +10,7 @@ TIME_GAP_S = 1.0
 STANDSTILL_GAP_M = 2.0
 LOOK_AHEAD_M = np.arange(1.0, 29.0, 1.5)  # places on the path ahead where obstacles are sought
 NO_GAP_M = 1e3
+BURST_PERIOD_S = 2.0
 
 
 def follow(speed_mps, desired_mps, gap_m, leader_mps) -> np.ndarray:
@@ -27,6 +28,21 @@ def follow(speed_mps, desired_mps, gap_m, leader_mps) -> np.ndarray:
     free = np.where(speed_mps <= desired_mps, 1 - (speed_mps / desired_mps) ** 4,
                     -COMFORTABLE_BRAKING_MPS2 / MAX_ACCELERATION_MPS2 * (1 - desired_mps / np.maximum(speed_mps, 0.1)))
     return MAX_ACCELERATION_MPS2 * (free - (interaction / np.maximum(gap_m, 0.3)) ** 2)
+
+
+def burst(seed: int, frame: int, rate_hz: float) -> np.ndarray | None:
+    """What a restless driver does at a frame instead of driving on: (pedal, steering), None most of the time.
+
+    In every BURST_PERIOD_S one burst: braking or throttle of 0.4 to 1 s, or steering of 0.3 to 0.5 s, so short that
+    the expert finds back to its lane. The same for the same seed and frame.
+    """
+    time_s = frame / rate_hz
+    rng = np.random.default_rng([seed, 11, int(time_s / BURST_PERIOD_S)])
+    kind, strength, start = rng.integers(4), rng.uniform(0.4, 1.0), rng.uniform(0.0, 0.5)
+    duration_s = rng.uniform(0.4, 1.0) if kind < 2 else rng.uniform(0.3, 0.5)
+    if not 0.0 <= time_s % BURST_PERIOD_S - start * BURST_PERIOD_S < duration_s:
+        return None
+    return np.array([(-strength, 0.0), (strength, 0.0), (0.0, -0.3 * strength), (0.0, 0.3 * strength)][kind])
 
 
 def find_leader(path_m: np.ndarray, path_yaw_rad: np.ndarray, obstacles_m: np.ndarray, velocity_mps: np.ndarray,

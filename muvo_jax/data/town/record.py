@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import functools
 import hashlib
 import json
 import os
@@ -19,10 +20,12 @@ import types
 from collections.abc import Callable, Iterator
 from typing import IO, NamedTuple, cast
 
+import numpy as np
+
 from muvo_jax import config as config_lib
 from muvo_jax.data import recorder, schema
-from muvo_jax.data.town import settings
-from muvo_jax.data.town.simulator import WEATHER_NAMES, Town
+from muvo_jax.data.town import driver, settings
+from muvo_jax.data.town.simulator import WEATHER_NAMES, Town, TownState
 
 fcntl: types.ModuleType | None
 try:
@@ -51,6 +54,8 @@ class Job(NamedTuple):
     seed: int
     weather: str
     frames: int
+    other_town: int = 0  # added to the town's seed
+    restless: bool = False
 
 
 def jobs(size: str) -> list[Job]:
@@ -62,8 +67,9 @@ def jobs(size: str) -> list[Job]:
     if size not in settings.SIZES:
         raise ValueError(f"town size {size!r} is unknown; known are {', '.join(settings.SIZES)}.")
     return [Job(split, f"{index:03d}_{plan.weathers[index % len(plan.weathers)]}", plan.first_seed + index,
-                plan.weathers[index % len(plan.weathers)], plan.frames)
-            for split, plan in settings.SIZES[size].items() for index in range(plan.runs)]
+                plan.weathers[index % len(plan.weathers)], plan.frames, 1 + index % 2 if restless else 0, restless)
+            for split, plan in settings.SIZES[size].items() for index in range(plan.runs)
+            for restless in [index >= plan.runs - plan.restless]]
 
 
 def cached_town(config: config_lib.Config, progress: Progress | None = None) -> pathlib.Path:
@@ -144,7 +150,7 @@ def record_run(directory: pathlib.Path, town: Town, job: Job) -> Iterator[int]:
         state = town.step(state, town.expert(state))
     for frame in range(job.frames):
         seen = town.render(state)
-        action = town.expert(state)
+        action = _chosen(town, state, job.restless)
         x_m, y_m, yaw_rad = state.pose
         writer.write({**seen, "occupancy": town.occupancy(seen), "frame_id": frame,
                       "timestamp_s": round(frame / town.config.contract.rate_hz, 6), "x_m": x_m, "y_m": y_m,
@@ -157,11 +163,22 @@ def record_run(directory: pathlib.Path, town: Town, job: Job) -> Iterator[int]:
     writer.close()
 
 
+def _chosen(town: Town, state: TownState, restless: bool) -> np.ndarray:
+    """The driver's action: the expert's, or what a burst makes of it; throttle only where there is room."""
+    action = town.expert(state)
+    sudden = driver.burst(int(state.seed), int(state.frame), town.config.contract.rate_hz) if restless else None
+    if sudden is None or (sudden[0] > 0 and action[0] < 0):
+        return action
+    return np.clip(np.where(sudden != 0, sudden, action), -1, 1).astype(np.float32)
+
+
 def _record_here(directory: pathlib.Path, town_config: settings.TownConfig, missing: list[Job]) -> Iterator[int]:
-    if missing:
-        town = Town(town_config)
-        for job in missing:
-            yield from record_run(directory, town, job)
+    yield from (count for job in missing for count in record_run(directory, _town(town_config, job.other_town), job))
+
+
+@functools.cache
+def _town(town_config: settings.TownConfig, other: int) -> Town:
+    return Town(dataclasses.replace(town_config, seed=town_config.seed + other))
 
 
 def _record_in_workers(directory: pathlib.Path, town_config: settings.TownConfig, missing: list[Job],
@@ -210,9 +227,9 @@ def _locked(directory: pathlib.Path) -> Iterator[None]:
 def _work() -> None:
     """What a worker does: reads its order from standard input and prints a line with the frames since the last one."""
     order = json.load(sys.stdin)
-    town = Town(config_lib.parse(settings.TownConfig, order["town"], "town"))
+    town_config = config_lib.parse(settings.TownConfig, order["town"], "town")
     for job in order["jobs"]:
-        frames = 0
+        frames, town = 0, _town(town_config, Job(*job).other_town)
         for frames, _ in enumerate(record_run(pathlib.Path(order["directory"]), town, Job(*job)), start=1):
             if frames % REPORT_FRAMES == 0:
                 _report(REPORT_FRAMES)

@@ -32,15 +32,18 @@ def main(folder: pathlib.Path) -> None:
     for _ in range(3):
         stream = sealed["observe_step"](weights, stream, observation, action)
 
-    state = {name: np.repeat(stream[name], 2, axis=0) for name in ("deterministic", "stochastic")}
-    plans = zeros(signatures["imagine"]["arguments"][2], 2)
+    _, state, plans, _ = signatures["imagine"]["arguments"]
+    state, plans = {name: np.repeat(stream[name], 2, axis=0) for name in state}, zeros(plans, 2)
+    memory = {name.removeprefix("memory/"): np.repeat(value, 2, axis=0) for name, value in stream.items()
+              if name.startswith("memory/")}
     plans[:, :, 0] = [[-0.5], [0.5]]
     keys = jax.random.key_data(jax.random.split(jax.random.key(1), 2))
     dream = sealed["imagine"](weights, keys, state, plans, np.float32(1))
     last = {name: value[:, -1] for name, value in dream.items()}
     for name in sorted(signatures):
         if name.startswith("decode_"):
-            print(f"{name} after {plans.shape[1]} steps: {sealed[name](weights, last).shape}")
+            looks = [memory] * (len(signatures[name]["arguments"]) - 1)
+            print(f"{name} after {plans.shape[1]} steps: {sealed[name](weights, last, *looks).shape}")
 
 
 if __name__ == "__main__":

@@ -12,6 +12,7 @@ use the plain convolutions, which every platform has.
 from __future__ import annotations
 
 import dataclasses
+import functools
 import importlib.util
 import json
 import pathlib
@@ -28,6 +29,7 @@ import tyro
 from muvo_jax import command_line, types
 from muvo_jax import config as config_lib
 from muvo_jax.model import live as live_lib
+from muvo_jax.model import memory as memory_lib
 from muvo_jax.model import rollout, world_model
 from muvo_jax.training import screen
 
@@ -116,32 +118,37 @@ def functions(model: world_model.WorldModel, weights: Mapping[str, Any], config:
     (batch,) = jax.export.symbolic_shape("b")
     array = lambda dtype, *shape: jax.ShapeDtypeStruct((batch, *shape), dtype)
     flat = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype), dict(weights))
-    one = model.initial_state(1)
-    state = {name: array(jnp.float32, *getattr(one, name).shape[1:]) for name in ("deterministic", "stochastic")}
+    remembered = lambda arrays: {f"memory/{name}": leaf for name, leaf in arrays.items()}
+    described = lambda tree: {name: array(leaf.dtype, *leaf.shape[1:]) for name, leaf in to_arrays(tree).items()}
+    state, memory = described(model.initial_state(1)), described(memory_lib.empty(model.config, 1))
     keys = array(jnp.uint32, *jax.random.key_data(jax.random.key(0)).shape)
-    live = {**state, "keys": keys, "frame": array(jnp.int32)}
+    live = {**state, **remembered(memory), "keys": keys, "frame": array(jnp.int32)}
     observation = {name: array(leaf.dtype, *leaf.shape) for name, leaf in inputs(config).items()}
 
     def observe_step(weights, live, observation, previous_action):
-        stream = live_lib.LiveState(types.LatentState(live["deterministic"], live["stochastic"]),
-                                    jax.random.wrap_key_data(live["keys"]), live["frame"])
+        tree = unflatten(live)
+        memory = types.Memory(**tree["memory"]) if "memory" in tree else None
+        stream = live_lib.LiveState(state_of(live), jax.random.wrap_key_data(live["keys"]), live["frame"], memory)
         stream = live_lib.observe_step(model, unflatten(weights), stream, observation, previous_action)
-        return {**vars(stream.latent), "keys": jax.random.key_data(stream.keys), "frame": stream.frame}
+        return {**to_arrays(stream.latent), **remembered(to_arrays(stream.memory)),
+                "keys": jax.random.key_data(stream.keys), "frame": stream.frame}
 
     def imagine(weights, keys, state, actions, temperature):
-        dream = rollout.imagine(model, unflatten(weights), jax.random.wrap_key_data(keys), types.LatentState(**state),
-                                actions, temperature=temperature)
-        return vars(dream.states)
+        dream = rollout.imagine(model, unflatten(weights), jax.random.wrap_key_data(keys), state_of(state), actions,
+                                temperature=temperature)
+        return to_arrays(dream.states)
 
-    def decode(head, weights, state):
-        return rollout.decode(model, unflatten(weights), types.LatentState(**state), (head,))[head]
+    def decode(head, weights, state, memory=None):
+        memory = None if memory is None else types.Memory(**memory)
+        return rollout.decode(model, unflatten(weights), state_of(state), (head,), memory=memory)[head]
 
     temperature = jax.ShapeDtypeStruct((), jnp.float32)
     made: dict[str, tuple[Callable, tuple]] = {
         "observe_step": (observe_step, (flat, live, observation, array(jnp.float32, 2))),
         "imagine": (imagine, (flat, keys, state, array(jnp.float32, horizon, 2), temperature))}
     for head in model.config.heads:
-        made[f"decode_{head}"] = (lambda weights, state, head=head: decode(head, weights, state), (flat, state))
+        looks = (memory,) if head in memory_lib.guessed_heads(model.config) else ()
+        made[f"decode_{head}"] = (functools.partial(decode, head), (flat, state, *looks))
     return made
 
 
@@ -149,6 +156,24 @@ def inputs(config: config_lib.Config) -> dict[str, jax.ShapeDtypeStruct]:
     """What the model reads of one observation: field of Batch -> [...] without batch and time, as live.observe_step."""
     return {name: jax.ShapeDtypeStruct(shape, types.BATCH_FIELDS[name][0])
             for name, shape in world_model.inputs(config.model).items()}
+
+
+def to_arrays(tree: Any) -> dict[str, Any]:
+    """A LatentState or Memory as {"deterministic": array, "vantage/motion/pose": array, ...}; None is empty."""
+    if tree is None:
+        return {}
+    parts = {name: value for name, value in vars(tree).items() if value is not None}
+    return {name if not inner else f"{name}/{inner}": leaf for name, value in parts.items()
+            for inner, leaf in (to_arrays(value) if hasattr(value, "__dataclass_fields__") else {"": value}).items()}
+
+
+def state_of(arrays: Mapping[str, Any]) -> types.LatentState:
+    """The LatentState that `to_arrays` took apart; other arrays are left alone."""
+    tree = unflatten(arrays)
+    vantage = tree.get("vantage")
+    if vantage is not None:
+        vantage = types.Vantage(**{**vantage, "motion": types.Motion(**vantage["motion"])})
+    return types.LatentState(tree["deterministic"], tree["stochastic"], vantage)
 
 
 def flatten(tree: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:

@@ -166,7 +166,7 @@ def observation(town: simulator.Town, state: simulator.TownState, config: config
     if config.model.lidar == "pp":
         fields["points"], fields["point_count"] = prepare.padded_points(seen["points_m"], config.model.pillars.points,
                                                                         0)
-    if config.model.camera == "bev":
+    if config.model.camera == "bev" or config.model.first_guess == "last_seen":
         fields |= {"intrinsics": town.renderer.intrinsics, "camera_to_ego": town.renderer.camera_to_ego}
     return fields
 
@@ -208,11 +208,11 @@ def film(loaded: run_lib.Run, town: simulator.Town, drive: closed_loop.Drive,
     """Frames of a planned drive: the town, what the model makes of it, what it expects at the end of its plan."""
     model, variables, key = loaded.model, loaded.variables, jax.random.key(options.seed)
     heads = tuple(head for head in protocol.HEADS if head in model.config.heads)
-    states, plans = closed_loop.latents(drive.moments)
+    states, memory, plans = closed_loop.latents(drive.moments)
     dreamt = rollout.imagine(model, variables, key, states, plans, sampled=False)
     views = []
     for latent in (states, jax.tree.map(lambda leaf: leaf[:, -1], dreamt.states)):
-        decoded = rollout.decode(model, variables, latent, heads)
+        decoded = rollout.decode(model, variables, latent, heads, memory=memory)
         frames = jax.device_get(protocol.finish(decoded))
         views.append(sheets.views_of_frames({head: value[None] for head, value in frames.items()}, 0))
     scene = sheets.Scene.of(loaded.config)

@@ -61,8 +61,8 @@ def town() -> config_lib.Config:
                                    occupancy_geometric_scal=0.05, action=0.2, kl=5e-4),
         optimizer=config_lib.OptimizerConfig(learning_rate=2e-3, warmup_fraction=0.1, clip_norm=10.0),
         data=config_lib.DataConfig(frames=12),
-        train=config_lib.TrainConfig(steps=460, batch=12, decode_frames=1, observe_frames=6, restart=True, validate_every=230,
-                                     checkpoint_every=230, preview_every=460, validation_windows=8),
+        train=config_lib.TrainConfig(steps=460, batch=12, decode_frames=1, observe_frames=6, restart=True,
+                                     validate_every=230, checkpoint_every=230, preview_every=460, validation_windows=8),
         evaluation=config_lib.EvaluationConfig(windows=32),
     )
 

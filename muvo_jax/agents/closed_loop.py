@@ -20,7 +20,7 @@ from muvo_jax.agents import environment as environment_lib
 from muvo_jax.agents import planners
 from muvo_jax.model import live
 from muvo_jax.ops import motion as motion_ops
-from muvo_jax.types import Array, ArrayLike, LatentState, Variables
+from muvo_jax.types import Array, ArrayLike, LatentState, Memory, Variables
 
 
 @dataclasses.dataclass(frozen=True)
@@ -194,7 +194,7 @@ def plan_step(environment: environment_lib.Environment, planner: str, config: pl
     filtered = live.observe_step(environment.model, variables, memory.live, observation, previous_action,
                                  sampled=False)
     speed_mps, route_map = observation["speed_mps"], observation.get("route_map")
-    bank = environment_lib.StartBank(filtered.latent, speed_mps, route_map)
+    bank = environment_lib.StartBank(filtered.latent, speed_mps, route_map, filtered.memory, jnp.zeros((1,), jnp.int32))
     horizon = memory.plan.shape[0]
     params = dataclasses.replace(environment.params(variables, bank, horizon), temperature=temperature)
     state = environment_lib.EnvState(filtered.latent[0], motion_ops.at_rest_of_frame(speed_mps[0]), jnp.int32(0),
@@ -204,11 +204,13 @@ def plan_step(environment: environment_lib.Environment, planner: str, config: pl
     return PlanMemory(filtered, plan.actions, plan.value)
 
 
-def latents(moments: Sequence[Moment]) -> tuple[LatentState, Array]:
-    """The filtered latents [T, ...] and plans [T, H, 2] of a planned drive."""
+def latents(moments: Sequence[Moment]) -> tuple[LatentState, Memory | None, Array]:
+    """The filtered latents [T, ...], what they remember [T, ...] and plans [T, H, 2] of a planned drive."""
     stack = lambda *leaves: jnp.concatenate(leaves)
-    states = jax.tree.map(stack, *(moment.memory.live.latent for moment in moments))
-    return states, jnp.stack([moment.memory.plan for moment in moments])
+    streams = [moment.memory.live for moment in moments]
+    states, memory = (jax.tree.map(stack, *parts) for parts in zip(*((live.latent, live.memory) for live in streams),
+                                                                   strict=True))
+    return states, memory, jnp.stack([moment.memory.plan for moment in moments])
 
 
 def expert_driver(simulator: Simulator) -> Driver:

@@ -20,9 +20,10 @@ from muvo_jax import config as config_lib
 from muvo_jax import run as run_lib
 from muvo_jax.agents import rewards
 from muvo_jax.model import checks
+from muvo_jax.model import memory as memory_lib
 from muvo_jax.model.world_model import WorldModel
 from muvo_jax.ops import motion as motion_ops
-from muvo_jax.types import Array, Batch, LatentState, Motion, Observed, Variables
+from muvo_jax.types import Array, Batch, LatentState, Memory, Motion, Observed, Variables
 
 ACTION_CHANNELS = checks.ACTION_CHANNELS
 RewardFunction = Callable[[rewards.Moment], tuple[Array, Array, dict[str, Array]]]
@@ -36,11 +37,15 @@ class StartBank:
       latent: LatentState [M, ...], filtered.
       speed_mps: float32 [M].
       route_map: uint8 [M, 64, 64], or None.
+      memory: Memory [W, ...] of W windows, for a model with first_guess="last_seen"; held once, whatever is imagined.
+      row: int32 [M], the window of each start.
     """
 
     latent: LatentState
     speed_mps: Array
     route_map: Array | None = None
+    memory: Memory | None = None
+    row: Array | None = None
 
     @property
     def size(self) -> int:
@@ -175,10 +180,14 @@ class Environment:
     @property
     def observation_shapes(self) -> Any:
         """jax.ShapeDtypeStruct of an observation: one, or a dict of them by head."""
-        features = jax.ShapeDtypeStruct(self.model.feature_shape, jnp.float32)
-        variables = self.model.variable_shapes()
-        return jax.eval_shape(lambda variables, features: self._observe(features, self._decode(variables, features)[0]),
-                              variables, features)
+        config = self.model.config
+
+        def example(variables):
+            latent = self.model.initial_state(1)
+            bank = StartBank(latent, jnp.zeros((1,)), None, memory_lib.empty(config, 1), jnp.zeros((1,), jnp.int32))
+            return self._observe(latent.features[0], self._decode(variables, bank, latent[0], jnp.int32(0))[0])
+
+        return jax.eval_shape(example, self.model.variable_shapes())
 
     @staticmethod
     def starts(observed: Observed, batch: Batch, *, skip: int = 0) -> StartBank:
@@ -198,8 +207,9 @@ class Environment:
         if not 0 <= skip < batch.frames:
             raise ValueError(f"Environment.starts: skip is {skip}, but windows have {batch.frames} frames.")
         merge = lambda leaf: jnp.asarray(leaf[:, skip:]).reshape(-1, *leaf.shape[2:])
+        rows = jnp.repeat(jnp.arange(batch.batch_size, dtype=jnp.int32), batch.frames - skip)
         return StartBank(jax.tree.map(merge, observed.states), merge(batch.speed_mps),
-                         None if batch.route_map is None else merge(batch.route_map))
+                         None if batch.route_map is None else merge(batch.route_map), observed.memory, rows)
 
     def params(self, variables: Variables, bank: StartBank, horizon: int, temperature: float = 1.0) -> EnvParams:
         """Checks and packs what the environment runs on.
@@ -212,6 +222,10 @@ class Environment:
             raise ValueError(f"StartBank: got states {list(lead)} and speeds {list(bank.speed_mps.shape)}; expected "
                              f"both [M] with M at least 1.")
         checks.counts(horizon, None)
+        guessed = memory_lib.guessed_heads(self.model.config)
+        if not set(guessed).isdisjoint(self.decoded_heads) and (bank.memory is None or bank.row is None):
+            raise ValueError(f"StartBank: it has no memory, but the heads {', '.join(guessed)} of this model look at "
+                             f"what was seen of late; make it of what `observe` returned (Environment.starts).")
         return EnvParams(jax.tree.map(jnp.asarray, variables), bank, jnp.int32(horizon), jnp.float32(temperature))
 
     def reset(self, key: Array, params: EnvParams) -> tuple[Any, EnvState]:
@@ -223,9 +237,9 @@ class Environment:
 
     def observe(self, state: EnvState, params: EnvParams) -> Any:
         """The observation of a state."""
-        features = state.latent.features
         wanted = () if self.observation == "features" else tuple(self.observation)
-        return self._observe(features, self._decode(params.variables, features, wanted)[0])
+        decoded, _ = self._decode(params.variables, params.bank, state.latent, state.start, wanted)
+        return self._observe(state.latent.features, decoded)
 
     def step(self, key: Array, state: EnvState, action: Array, params: EnvParams) -> tuple[EnvState, Transition]:
         """One imagined step under action [2], clipped to [-1, 1]; see Transition. No auto-reset: `restart` does it."""
@@ -234,7 +248,7 @@ class Environment:
         batched = jax.tree.map(lambda leaf: jnp.expand_dims(leaf, 0), (noise, action, state.latent))
         latent, _ = self.model.imagine_step(params.variables, *batched)
         latent = latent[0]
-        full, for_reward = self._decode(params.variables, latent.features)
+        full, for_reward = self._decode(params.variables, params.bank, latent, state.start)
         motion = state.motion
         if self.ego_path == "bicycle":
             motion = motion_ops.drive(motion, action, self.contract, self.periods)
@@ -260,12 +274,14 @@ class Environment:
         return rewards.driving_reward(moment, grid=self.model.config.voxels, contract=self.contract, step_s=self.step_s,
                                       config=self.reward_config)
 
-    def _decode(self, variables: Variables, features: Array, heads: tuple[str, ...] | None = None):
+    def _decode(self, variables: Variables, bank: StartBank, latent: LatentState, start: Array,
+                heads: tuple[str, ...] | None = None):
         """(full-size predictions, predictions for the reward) of the heads; unused ones are dropped by the compiler."""
         names = self.decoded_heads if heads is None else heads
         if not names:
             return {}, {}
-        predictions = self.model.decode(variables, features, names)
+        row = None if bank.row is None else bank.row[start]
+        predictions = self.model.decode(variables, latent, names, bank.memory, row)
         full = {name: predictions[name] for name in names}
         return full, full if "occupancy" not in names else {
             **full, "occupancy": predictions.at_scale(self.reward_config.occupancy_scale).occupancy}

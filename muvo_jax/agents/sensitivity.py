@@ -17,7 +17,7 @@ import numpy as np
 from muvo_jax.agents import closed_loop, uncertainty
 from muvo_jax.model import live, rollout
 from muvo_jax.model.world_model import WorldModel
-from muvo_jax.types import OCCUPANCY_OCCUPIED, OCCUPANCY_UNKNOWN, Array, ArrayLike, LatentState, Variables
+from muvo_jax.types import OCCUPANCY_OCCUPIED, OCCUPANCY_UNKNOWN, Array, ArrayLike, Variables
 
 HEADS = ("image", "range_view", "occupancy", "ego_motion")
 Moved = Callable[[Sequence[Any], Sequence[float], int], Mapping[str, np.ndarray]]
@@ -57,13 +57,16 @@ def measure(simulator: closed_loop.Simulator, truth: Callable[[Any], Mapping[str
     key_watch, key_imagine = jax.random.split(key)
     started = [watch(simulator, model, variables, jax.random.fold_in(key_watch, seed), seed, context) for seed in seeds]
     states = [state for state, _ in started]
-    latents = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *(latent for _, latent in started))
+    join = lambda *leaves: jnp.concatenate(leaves)
+    latents, memory = (jax.tree.map(join, *parts) for parts in zip(
+        *((stream.latent, stream.memory) for _, stream in started), strict=True))
     scores: Answers = {steps: {} for steps in horizons}
     for name, pair in CONTRASTS.items():
         plans = np.broadcast_to(np.asarray(pair, np.float32)[None, :, None], (len(seeds), 2, horizon, 2))
         dream = rollout.imagine(model, variables, key_imagine, latents, plans, same_noise=True)
         # One drive at a time is decoded, so that many need no more memory than one.
-        decoded = [[jax.device_get(rollout.decode(model, variables, dream.states[drive, plan], heads))
+        decoded = [[jax.device_get(rollout.decode(model, variables, dream.states[drive, plan], heads, memory=memory,
+                                                  rows=np.full(horizon, drive, np.int32)))
                     for drive in range(len(seeds))] for plan in (0, 1)]
         shown = [[follow(simulator, truth, state, action, horizon) for state in states] for action in pair]
         beside = [moved(states, action, horizon) if moved else {} for action in pair]
@@ -81,8 +84,8 @@ def measure(simulator: closed_loop.Simulator, truth: Callable[[Any], Mapping[str
 
 
 def watch(simulator: closed_loop.Simulator, model: WorldModel, variables: Variables, key: Array, seed: int,
-          context: int) -> tuple[Any, LatentState]:
-    """The simulator's state after `context` steps of the expert, and the latent [1, ...] that saw all of them."""
+          context: int) -> tuple[Any, live.LiveState]:
+    """The simulator's state after `context` steps of the expert, and the stream of one that saw all of them."""
     state, stream, previous = simulator.reset(seed), live.start_live(model, key), np.zeros(2, np.float32)
     for step in range(context + 1):
         if step:
@@ -90,7 +93,7 @@ def watch(simulator: closed_loop.Simulator, model: WorldModel, variables: Variab
             state = simulator.step(state, previous)
         observation = {name: np.asarray(value)[None] for name, value in simulator.observe(state).items()}
         stream = live.observe_step(model, variables, stream, observation, previous[None], sampled=False)
-    return state, stream.latent
+    return state, stream
 
 
 def follow(simulator: closed_loop.Simulator, truth: Callable[[Any], Mapping[str, ArrayLike]], state: Any,

@@ -6,9 +6,8 @@ import dataclasses
 from typing import Any
 
 import flax.struct
-import numpy as np
-
 import jax
+import numpy as np
 
 from muvo_jax import types
 from muvo_jax.ops import resample

@@ -29,8 +29,8 @@ def state(model: WorldModel, latent: LatentState) -> tuple[int, ...]:
         leads.append(shape[:len(shape) - len(tail)])
     vantage = latent.vantage
     if model.config.tracks_motion and vantage is None:
-        raise ValueError("state: it has no vantage, but this model keeps track of its motion; take states of `observe`, "
-                         "`observe_step` or `imagine`.")
+        raise ValueError("state: it has no vantage, but this model keeps track of its motion; take states of "
+                         "`observe`, `observe_step` or `imagine`.")
     if vantage is not None and jnp.shape(vantage.last) != leads[0]:
         raise ValueError(f"state: deterministic has the leading axes {list(leads[0])}, vantage "
                          f"{list(jnp.shape(vantage.last))}.")

@@ -56,7 +56,8 @@ class GuidedDecoder(linen.Module):
         grow = lambda name, x, features: _activation(conv_cpu.depth_to_space(dense(name, x, 4 * features), (2, 2)))
         down = {1: seen.astype(compute.dtype)}
         for scale in (2, 4, 8):
-            down[scale] = conv(f"see_{scale}", conv_cpu.space_to_depth(down[scale // 2], (2, 2)), width // _WIDTHS[scale])
+            blocks = conv_cpu.space_to_depth(down[scale // 2], (2, 2))
+            down[scale] = conv(f"see_{scale}", blocks, width // _WIDTHS[scale])
         x = self._latent(features, width)
         while x.shape[1] < self.plane[0] // 8:
             x = grow(f"pre_{x.shape[1]}", x, width)
@@ -70,7 +71,7 @@ class GuidedDecoder(linen.Module):
 
     def _latent(self, features: jax.Array, width: int) -> jax.Array:
         """The latent as a map of the plane: the head's tokens, or a vector unfolded."""
-        config, compute = self.config, common.compute(self.config)
+        compute = common.compute(self.config)
         if features.ndim == 2:
             shrink = _SHRINK.get(self.head, 8)
             size = tuple(math.ceil(side / shrink) for side in self.plane)
@@ -82,7 +83,7 @@ class GuidedDecoder(linen.Module):
 
 
 class GuidedHead(linen.Module):
-    """One head of a model with memory: (features, Glimpse, numbers, average frame) -> {scale: raw prediction}, as heads.TABLE has it."""
+    """One head of a model with memory: (features, Glimpse, numbers, average frame) -> {scale: prediction in raw units}."""
 
     config: ModelConfig
     head: str
@@ -153,7 +154,8 @@ def _compose_ranges(raw, glimpse: memory.Glimpse, mean, config: ModelConfig) -> 
         # Decided, because half a range is no range; the gradient is that of the probability.
         returned = jax.lax.stop_gradient((logit > 0.0).astype(jnp.float32) - soft) + soft
         range_ = nothing + returned * (range_ - nothing)
-        result[scale] = jnp.concatenate([value[..., :3] + average[scale][..., :3], jnp.expand_dims(range_, -1)], axis=-1)
+        points = value[..., :3] + average[scale][..., :3]
+        result[scale] = jnp.concatenate([points, jnp.expand_dims(range_, -1)], axis=-1)
     return result
 
 

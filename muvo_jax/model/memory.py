@@ -16,7 +16,7 @@ import jax.numpy as jnp
 from muvo_jax.config import NO_SENSOR, ModelConfig
 from muvo_jax.ops import motion as motion_ops
 from muvo_jax.ops import reproject
-from muvo_jax.types import Array, Batch, LatentState, Memory, Motion, Vantage
+from muvo_jax.types import RANGE_NO_RETURN_M, Array, Batch, LatentState, Memory, Motion, Vantage
 
 FADE = 0.8  # weight of evidence that is one observation older: what moved away is forgotten
 
@@ -27,8 +27,8 @@ class Glimpse:
 
     Attributes:
       image: float32 [n, H, W, 3] in [0, 1], the newest image moved, and `covered` [n, H, W, 1], 1 where it was seen.
-      moved_m, newest_m, still_m: float32 [n, Hr, Wr] ranges, -1 where nothing is: all scans moved, the newest moved, and
-        the newest as it was (the rings on the ground do not move).
+      moved_m, newest_m, still_m: float32 [n, Hr, Wr] ranges, -1 where nothing is: all scans moved, the newest moved,
+        and the newest as it was.
       filled_m: float32 [n, Hr, Wr], moved_m with its small holes filled.
       sky: float32 [n, Hr, Wr], 1 where a pixel without a return came to lie.
       height_m: float32 [n, Hr, Wr], of the moved returns over the road.
@@ -175,8 +175,8 @@ def check(config: ModelConfig, states: LatentState | Array, memory: Memory | Non
         came = "features" if not isinstance(states, LatentState) else (
             "states without a vantage" if states.vantage is None else "states")
         raise ValueError(f"decode: got {came}{' and no memory' if memory is None else ''}, but the heads {heads} of "
-                         f"this model (first_guess='last_seen') look at what was seen of late. Pass states of `observe` "
-                         f"or `imagine` and memory=observed.memory (live.memory of a stream).")
+                         f"this model (first_guess='last_seen') look at what was seen of late. Pass states of "
+                         f"`observe` or `imagine` and memory=observed.memory (live.memory of a stream).")
     drives = memory.pose.shape[0]
     for name, shape in inputs(config).items():
         value = getattr(memory, name)
@@ -193,7 +193,8 @@ def check(config: ModelConfig, states: LatentState | Array, memory: Memory | Non
     return flat, jnp.repeat(jnp.arange(drives, dtype=jnp.int32), count // drives)
 
 
-def look(config: ModelConfig, memory: Memory, rows: Array, vantage: Vantage, heads: tuple[str, ...]) -> dict[str, Glimpse]:
+def look(config: ModelConfig, memory: Memory, rows: Array, vantage: Vantage,
+         heads: tuple[str, ...]) -> dict[str, Glimpse]:
     """The memory as it looks from n vantages, for those of the heads that it can tell something.
 
     Args:
@@ -237,8 +238,10 @@ def _ranges(config: ModelConfig, memory: Memory, rows: Array, index: Array, know
     fresh = known[:, -1].reshape(-1, 1, 1)
     sky = reproject.move_sky(still, pose[:, -1], geometry) & fresh & (moved[..., 3] <= 0.0)
     filled_m = reproject.fill_holes(moved[..., 3], sky, geometry)
-    return Glimpse(moved_m=moved[..., 3], newest_m=newest[..., 3], filled_m=filled_m, still_m=jnp.where(fresh, still[..., 3], -1.0),
-                   sky=sky.astype(jnp.float32), height_m=jnp.where(moved[..., 3] > 0.0, moved[..., 2], 0.0))
+    still_m = jnp.where(fresh, still[..., 3], RANGE_NO_RETURN_M)
+    height_m = jnp.where(moved[..., 3] > 0.0, moved[..., 2], 0.0)
+    return Glimpse(moved_m=moved[..., 3], newest_m=newest[..., 3], filled_m=filled_m, still_m=still_m,
+                   sky=sky.astype(jnp.float32), height_m=height_m)
 
 
 def _image(config: ModelConfig, memory: Memory, rows: Array, index: Array, known: Array, pose: Array,

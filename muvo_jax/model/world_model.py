@@ -33,7 +33,19 @@ from muvo_jax.model import (
 from muvo_jax.model import memory as memory_lib
 from muvo_jax.nn import init as init_lib
 from muvo_jax.nn import layers, norm
-from muvo_jax.types import BATCH_FIELDS, UNTIMED_FIELDS, Batch, Gaussian, LatentState, Memory, Motion, Predictions, StepNoise, Variables, Vantage
+from muvo_jax.types import (
+    BATCH_FIELDS,
+    UNTIMED_FIELDS,
+    Batch,
+    Gaussian,
+    LatentState,
+    Memory,
+    Motion,
+    Predictions,
+    StepNoise,
+    Vantage,
+    Variables,
+)
 
 ROUTE_MAP_SIZE = (64, 64)
 

@@ -1,7 +1,8 @@
 """Targets at the decoders' scales (paper section III-D): full size, half and quarter.
 
 Images are averaged over 2x2 pixels. Range views are subsampled (index 2i), because the mean of a return and of a hole
-means nothing. Occupancy is pooled: what a coarse voxel covers is occupied if any of it is. Each scale comes from the one before, as in the reference.
+means nothing. Occupancy is pooled: a coarse voxel is occupied if any that it covers is. Each scale comes from the one
+before, as in the reference.
 """
 
 from __future__ import annotations
@@ -35,7 +36,8 @@ def occupancy_labels(occupancy: types.ArrayLike, *, pooled: bool = True) -> dict
     """
     labels = {1: jnp.asarray(occupancy)}
     for scale in SCALES[1:]:
-        labels[scale] = resample.pool_occupancy(labels[scale // 2]) if pooled else labels[1][..., ::scale, ::scale, ::scale]
+        finer = labels[scale // 2]
+        labels[scale] = resample.pool_occupancy(finer) if pooled else finer[..., ::2, ::2, ::2]
     return labels
 
 

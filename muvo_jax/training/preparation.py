@@ -63,8 +63,8 @@ def expected_batch(config: config_lib.Config, windows: int, *,
 
     Args:
       config: adapted to the data, or a preset of the built-in town.
-      recorded: modalities of the recording (schema.RecordingDescription); by default what the built-in town has of those
-        that every batch brings along, whatever the model reads.
+      recorded: modalities of the recording (schema.RecordingDescription); by default what the built-in town has of
+        those that every batch brings along, whatever the model reads.
     """
     model, prefix = config.model, (windows, config.data.frames)
 

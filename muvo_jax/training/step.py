@@ -27,7 +27,8 @@ from muvo_jax.training import parallel as parallel_lib
 from muvo_jax.training import state as state_lib
 
 Metrics = dict[str, types.Array]
-_DECODE_SITE, _IMAGINE_SITE, _RESTART_SITE = 0xDEC0, 0x1A61, 0x2E57  # separate these draws from all others made with the same sample key
+# Separate these draws from all others made with the same sample key.
+_DECODE_SITE, _IMAGINE_SITE, _RESTART_SITE = 0xDEC0, 0x1A61, 0x2E57
 _VALIDATION_STEP = 2**31 - 1  # folded into the key where training folds its step in; no run gets there
 
 
@@ -202,7 +203,7 @@ def forward(params: Any, batch_stats: Any, batch: types.Batch, keys: types.Array
             shown = shown.replace(is_first=_restarted(shown.is_first, keys))
     observed, batch_stats = maybe_remat(observe)(variables, shown, keys)
     states, memory = observed.states, observed.memory
-    if memory is not None and memory.image is not None:  # as recorded: a moved picture is compared with the recorded one
+    if memory is not None and memory.image is not None:  # not augmented: the target is not either
         memory = memory.replace(image=jnp.asarray(batch.image)[:, :seen])
     if train:
         states = _and_imagined(model, variables, observed, batch.action, keys)

@@ -13,6 +13,7 @@ class AugmentationConfig:
 
     Attributes:
       image, route: whether images and route maps are changed at all.
+      light: put every second window as a whole, inputs and targets, in another light (training/light.py).
       mirror: exchange left and right of every second window, drawn anew each time: in all of its fields, inputs,
         actions and targets alike. For sensors that are symmetric about the middle of the car and look ahead.
       blur, sharpen: probability that a frame is blurred, or else sharpened.
@@ -32,6 +33,7 @@ class AugmentationConfig:
     image: bool = False
     route: bool = False
     mirror: bool = False
+    light: bool = False
     blur: float = 0.3
     sharpen: float = 0.3
     blur_std_px: tuple[float, float] = (0.1, 1.7)

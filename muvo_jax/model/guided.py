@@ -19,9 +19,9 @@ from muvo_jax.nn import layers
 from muvo_jax.ops import conv_cpu, resample
 from muvo_jax.types import RANGE_NO_RETURN_M, Vantage
 
-SCALES = (4, 2, 1)
+SCALES = (1, 2, 4)
 _SHRINK = {"image": tokens.IMAGE_SHRINK, "range_view": tokens.RANGE_VIEW_SHRINK}
-_WIDTHS = {8: 1, 4: 1, 2: 2, 1: 4}  # what the width is divided by at each scale
+_WIDTHS = {8: 1, 4: 1, 2: 2}  # what the width is divided by at each scale
 _TRUST = 3.0  # log-odds that evidence of a hit or of a look through is worth to a fresh model
 _NEAR_M = 10.0  # ranges are seen as 10 m / (10 m + range) too: near ones matter
 _OVER_ROAD_M = 0.5  # a fresh model believes evidence above this height; the road's rings do not move with the world
@@ -62,12 +62,15 @@ class GuidedDecoder(linen.Module):
         while x.shape[1] < self.plane[0] // 8:
             x = grow(f"pre_{x.shape[1]}", x, width)
         x = conv("join", x + down[8] + layers.spread(dense("numbers", numbers, width), 4), width)
-        out = {}
-        for scale in SCALES:
+        out, channels = {}, dict(self.outputs)
+        for scale in (4, 2):
             x = grow(f"grow_{scale}", x, width // _WIDTHS[scale])
             x = conv(f"draw_{scale}", jnp.concatenate([x, down[scale]], axis=-1), width // _WIDTHS[scale])
-            out[scale] = dense(f"head_{scale}", x, dict(self.outputs)[scale]).astype(jnp.float32)
-        return out
+            out[scale] = dense(f"head_{scale}", x, channels[scale]).astype(jnp.float32)
+        # Full size is drawn in blocks of 2x2 pixels: a quarter of the places, with channels enough for a fast product.
+        x = conv("draw_1", jnp.concatenate([x, conv_cpu.space_to_depth(down[1], (2, 2))], axis=-1), width // _WIDTHS[2])
+        blocks = dense("head_1", x, 4 * channels[1]).astype(jnp.float32)
+        return {1: conv_cpu.depth_to_space(blocks, (2, 2)), **out}
 
     def _latent(self, features: jax.Array, width: int) -> jax.Array:
         """The latent as a map of the plane: the head's tokens, or a vector unfolded."""
@@ -83,7 +86,7 @@ class GuidedDecoder(linen.Module):
 
 
 class GuidedHead(linen.Module):
-    """One head of a model with memory: (features, Glimpse, numbers, average frame) -> {scale: prediction in raw units}."""
+    """One head of a model with memory: (features, Glimpse, numbers, average frame) -> {scale: raw prediction}."""
 
     config: ModelConfig
     head: str
@@ -168,7 +171,8 @@ def _compose_voxels(raw, glimpse: memory.Glimpse, mean, config: ModelConfig) -> 
     grid = config.voxels
     heights = grid.origin_m[2] + grid.voxel_size_m * jnp.arange(grid.shape[2])
     trust = jnp.where(heights >= _OVER_ROAD_M - 1e-3, _TRUST, 0.0).reshape(1, 1, 1, -1)
-    believed = trust * jnp.clip(glimpse.newest + glimpse.older, -1.0, 1.0)
+    # The newest scan has the say; the older ones where it has none. (Added up, what moves is cancelled out.)
+    believed = trust * (glimpse.newest + (1.0 - jnp.abs(glimpse.newest)) * glimpse.older)
     raw = {scale: value.reshape(*value.shape[:3], -1, 2) for scale, value in raw.items()}
     own, result = mean(raw), {}
     for scale in (1, 2, 4):

@@ -47,17 +47,26 @@ class OccupancySums:
                 f"occupancy_geometric_scal_{scale}": geometric_scal(self)}
 
 
-def occupancy_sums(logits: types.Array, target: types.Array, unknown_is_empty: bool = False) -> OccupancySums:
+def occupancy_sums(logits: types.Array, target: types.Array, unknown_is_empty: bool = False,
+                   unknown_weight: float = 0.0) -> OccupancySums:
     """Sums over all voxels of a scale.
 
     Args:
       logits: float [..., 2], (empty, occupied).
       target: uint8 [...], 0 empty, 1 occupied, 255 unknown.
       unknown_is_empty: whether unknown voxels count as empty; otherwise they do not count.
+      unknown_weight: what an unknown voxel counts, as empty, in the cross-entropy alone.
     """
     if unknown_is_empty:
         target = jnp.where(target == types.OCCUPANCY_UNKNOWN, jnp.uint8(types.OCCUPANCY_EMPTY), target)
-    return _known_sums(logits, target)
+    sums = _known_sums(logits, target)
+    if not unknown_weight:
+        return sums
+    unknown = target == types.OCCUPANCY_UNKNOWN
+    margin = logits[..., 1].astype(jnp.float32) - logits[..., 0].astype(jnp.float32)
+    added = unknown_weight * jnp.where(unknown, jax.nn.softplus(margin), 0.0).sum()
+    counted = unknown_weight * unknown.sum().astype(jnp.float32)
+    return sums.replace(cross_entropy=sums.cross_entropy + added, voxels=sums.voxels + counted)
 
 
 @jax.checkpoint  # the backward pass then keeps only the arguments, not a dozen arrays of their size

@@ -108,7 +108,8 @@ def _occupancy(inputs: Inputs) -> dict[str, Sums]:
     sums: dict[str, Sums] = {}
     for scale, target in labels.occupancy_labels(
             inputs.truth("occupancy"), pooled=inputs.model.numerics == "standard").items():
-        sums[f"occupancy_{scale}"] = scal.occupancy_sums(inputs.predictions[scale], target, unknown_is_empty)
+        sums[f"occupancy_{scale}"] = scal.occupancy_sums(inputs.predictions[scale], target, unknown_is_empty,
+                                                         inputs.loss.occupancy_unknown_weight)
         if inputs.loss.occupancy_dice:
             sums[f"occupancy_dice_{scale}"] = classification.occupancy_dice_sums(inputs.predictions[scale], target,
                                                                                  unknown_is_empty)

@@ -151,29 +151,27 @@ def onto_beams(range_view: Array, geometry: RangeViewGeometry) -> Array:
 
 
 def fill_holes(range_m: Array, sky: Array, geometry: RangeViewGeometry, rounds: int = 2) -> Array:
-    """Ranges [N, Hr, Wr] in which pixels that neither returned nor are `sky` take the mean of their neighbours.
+    """Ranges [N, Hr, Wr] in which pixels that neither returned nor are `sky` take the nearest of their neighbours'.
 
-    Of inverse horizontal distances, so that a neighbouring sky counts as 0 and not as infinity. For looking things up,
-    not a measurement. Pixels that stay unknown, and sky, hold -1.
+    By horizontal distance; a pixel whose known neighbours are all sky becomes sky. What stays unknown, and sky, holds
+    -1. (The mean of the neighbours instead hangs points in the air between an edge and what lies behind it.)
     """
     flat = jnp.sqrt(1.0 - jnp.asarray(range_view_ops.beam_directions(geometry))[None, ..., 2] ** 2)
     returned = range_m > 0.0
-    nearness = jnp.where(returned, 1.0 / jnp.where(returned, range_m * flat, 1.0), 0.0)
-    known = returned | sky
+    # 1 / horizontal distance, 0 for sky, -1 unknown: the largest of the neighbours is the nearest.
+    nearness = jnp.where(returned, 1.0 / jnp.where(returned, range_m * flat, 1.0), jnp.where(sky, 0.0, -1.0))
     for _ in range(rounds):
-        total, count = _neighbours(jnp.where(known, nearness, 0.0)), _neighbours(known.astype(jnp.float32))
-        nearness = jnp.where(known, nearness, total / jnp.maximum(count, 1.0))
-        known = known | (count > 0)
+        nearness = jnp.where(nearness < 0.0, _largest_neighbour(nearness), nearness)
     near = nearness > 1.0 / FAR_M
     return jnp.where(near, 1.0 / (jnp.where(near, nearness, 1.0) * flat), RANGE_NO_RETURN_M)
 
 
-def _neighbours(values: Array) -> Array:
-    """Sums over 3x3 pixels of [N, Hr, Wr]; columns go round, rows end."""
+def _largest_neighbour(values: Array) -> Array:
+    """The largest of 3x3 pixels of [N, Hr, Wr]; columns go round, rows end."""
     wide = jnp.concatenate([values[:, :, -1:], values, values[:, :, :1]], axis=2)
-    across = wide[:, :, :-2] + wide[:, :, 1:-1] + wide[:, :, 2:]
-    tall = jnp.pad(across, ((0, 0), (1, 1), (0, 0)))
-    return tall[:, :-2] + tall[:, 1:-1] + tall[:, 2:]
+    across = jnp.maximum(jnp.maximum(wide[:, :, :-2], wide[:, :, 1:-1]), wide[:, :, 2:])
+    tall = jnp.pad(across, ((0, 0), (1, 1), (0, 0)), constant_values=-1.0)
+    return jnp.maximum(jnp.maximum(tall[:, :-2], tall[:, 1:-1]), tall[:, 2:])
 
 
 def _lidar_m(geometry: RangeViewGeometry) -> Array:

@@ -21,7 +21,7 @@ from muvo_jax import types
 from muvo_jax.metrics import image as image_metrics
 from muvo_jax.model import rollout, world_model
 from muvo_jax.objectives import perceptual, total
-from muvo_jax.training import augmentation, mirror
+from muvo_jax.training import augmentation, light, mirror
 from muvo_jax.training import optimizer as optimizer_lib
 from muvo_jax.training import parallel as parallel_lib
 from muvo_jax.training import state as state_lib
@@ -192,6 +192,8 @@ def forward(params: Any, batch_stats: Any, batch: types.Batch, keys: types.Array
     """
     if train and config.augmentation.mirror:
         batch = mirror.randomly(batch, keys)
+    if train and config.augmentation.light:
+        batch = light.randomly(batch, keys)
     maybe_remat = jax.checkpoint if config.train.remat else lambda function: function
     variables = {"params": params, "batch_stats": batch_stats}
     seen = min(config.train.observe_frames or batch.frames, batch.frames) if train else batch.frames

@@ -1,4 +1,4 @@
-"""Another light on whole training windows: inputs and targets alike, so that weathers of which there are few teach more.
+"""Another light on whole training windows, inputs and targets alike, so that few weathers teach more.
 
 Unlike the photometric noise of augmentation.py, which the encoders alone see, this is another world under the same
 geometry: every image of a window is tinted, darkened and hazed in one way.
@@ -37,5 +37,6 @@ def randomly(batch: types.Batch, keys: types.Array) -> types.Batch:
         return jnp.where(on, factor * (1.0 - share), 1.0), jnp.where(on, offset, 0.0)
 
     factor, offset = jax.vmap(draw)(keys)
-    image = jnp.asarray(batch.image).astype(jnp.float32) * factor.reshape(-1, 1, 1, 1, 3) + offset.reshape(-1, 1, 1, 1, 1)
+    image = jnp.asarray(batch.image).astype(jnp.float32) * factor.reshape(-1, 1, 1, 1, 3)
+    image = image + offset.reshape(-1, 1, 1, 1, 1)
     return dataclasses.replace(batch, image=jnp.clip(jnp.round(image), 0.0, 255.0).astype(jnp.uint8))

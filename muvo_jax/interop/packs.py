@@ -12,6 +12,7 @@ import json
 import os
 import pathlib
 import zipfile
+import zlib
 from collections.abc import Mapping
 from typing import Any
 
@@ -38,7 +39,7 @@ class Pack:
         try:
             with np.load(self.path, allow_pickle=False) as stored:
                 self.arrays = {name: stored[name] for name in stored.files}
-        except (OSError, ValueError, zipfile.BadZipFile) as error:
+        except (OSError, ValueError, EOFError, zlib.error, zipfile.BadZipFile) as error:
             raise PackError(f"{self.path}: expected an npz file of plain arrays ({error}).") from error
         self.names = sorted({name.split("::")[0] for name in self.arrays})
 

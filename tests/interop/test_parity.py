@@ -101,6 +101,31 @@ def test_a_wrong_number_and_an_unknown_entry_fail(tmp_path):
     assert any("hyperbolic/loss" in line for line in report.lines())
 
 
+def test_what_stops_fails_and_hides_nothing_else(tmp_path):
+    """A group that raises, a measure that raises, a file that is cut off: each fails, the others are checked."""
+    def stops(context):
+        yield cases.Check("early", np.float32(1.0), 1e-6)
+        raise MemoryError("no room for late")
+
+    def unmeasurable(pack, entry, got):
+        raise IndexError("no such pixel")
+
+    groups = (stops, lambda context: (cases.Check("odd", np.float32(1.0), 1e-6, unmeasurable),
+                                      cases.Check("last", np.float32(1.0), 1e-6)))
+    entries = {name: np.float32(1.0) for name in ("early", "late", "odd", "last", "told")}
+    np.savez(write_folder(tmp_path, entries) / "broken.npz", x=np.zeros(9))
+    (tmp_path / "broken.npz").write_bytes((tmp_path / "broken.npz").read_bytes()[:90])
+    packs_of = [cases.PackChecks("broken", (r"broken\.npz",), groups),
+                cases.PackChecks("p1", (r"p1_.*",), groups, {"told": "for information only"})]
+    lines = []
+    report = runner.run_folder(tmp_path, packs_of, write=lines.append)
+    assert (report.passed, report.failed, report.left_out.total(), report.unexplained) == (2, 3, 1, []) and not report.ok
+    failed = {line.split()[1]: line for line in lines if "FAIL" in line}
+    assert "stops stopped with MemoryError: no room for late" in failed["late"]
+    assert "IndexError: no such pixel" in failed["odd"] and any("broken.npz: expected an npz file" in line
+                                                                for line in report.lines())
+
+
 def test_what_cannot_be_checked_is_said(tmp_path):
     with pytest.raises(packs.PackError, match="found none"):
         runner.run_folder(tmp_path, registry.PACKS, write=SILENT)
@@ -108,8 +133,8 @@ def test_what_cannot_be_checked_is_said(tmp_path):
     with pytest.raises(packs.PackError, match=r"pack\.json: expected the JSON description"):
         runner.run_folder(tmp_path, registry.PACKS, write=SILENT)
     write_folder(tmp_path, {"x": np.array([object()])}, seed=0)
-    with pytest.raises(packs.PackError, match=r"p1_losses_metrics\.npz: expected an npz file of plain arrays"):
-        runner.run_folder(tmp_path, registry.PACKS, write=SILENT)
+    objects = runner.run_folder(tmp_path, registry.PACKS, write=SILENT)
+    assert "p1_losses_metrics.npz: expected an npz file of plain arrays" in objects.stopped[0] and objects.failed == 1
     (tmp_path / "pack.json").write_text(json.dumps({"format": 9}))
     with pytest.raises(packs.PackError, match="expected format 1, found 9"):
         runner.run_folder(tmp_path, registry.PACKS, write=SILENT)

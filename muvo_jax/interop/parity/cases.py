@@ -21,10 +21,12 @@ class Check:
       tolerance: the largest error that passes.
       measure: (pack, entry, got) -> error; by default that of packs.Pack.error.
       stands_alone: whether the expected value lies elsewhere than in the pack (in `measure`).
-      again: the same value on weights that differ by rounding (drawing.rounded_anew), asked for only where `got` misses
-        the tolerance. At a kink of the function it is chance on which side float32 comes out, in the reference too, so
-        one of these may be its value. Of a smooth one this gives the mean over such weights (drawing.rounded_in_pairs),
-        from which our own rounding is gone.
+      again: the same value on weights or inputs that differ by rounding (rounding.anew), asked for only where `got`
+        misses the tolerance. At a kink of the function it is chance on which side float32 comes out, in the reference
+        too, so one of these may be its value.
+      roundings: the same value on weights moved back and forth (rounding.in_pairs), asked for only where `got` misses
+        the tolerance and the stored value is near zero; see rounding.error_near_zero.
+      note: what the line of the entry says in the end.
     """
 
     entry: str
@@ -33,6 +35,8 @@ class Check:
     measure: Callable[[packs.Pack, str, Any], float] = packs.Pack.error
     stands_alone: bool = False
     again: Callable[[], Iterator[Any]] | None = None
+    roundings: Callable[[], Iterator[Any]] | None = None
+    note: str = ""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -52,6 +56,14 @@ class Context:
     def draw(self, name: str, shape: tuple[int, ...], kind: str):
         """An input by the rule, with the seed of the folder."""
         return self.settings.draw(name, shape, kind)
+
+    def size(self, *path: str) -> Any:
+        """A size by its place in pack.json, see packs.Settings.size."""
+        return self.settings.size(*path)
+
+    def shape(self, *entries: str) -> tuple[int, ...] | None:
+        """The shape of the first of some entries that the pack holds; what an array shows goes before pack.json."""
+        return next((self.pack.shape(entry) for entry in entries if entry in self.pack), None)
 
 
 Group = Callable[[Context], Iterator[Check]]

@@ -9,7 +9,7 @@ import pathlib
 from collections.abc import Callable, Iterable, Sequence
 
 from muvo_jax.interop import packs
-from muvo_jax.interop.parity import cases
+from muvo_jax.interop.parity import cases, rounding
 
 Print = Callable[[str], None]
 RECORDINGS_REASON = "needs recordings: give their folder with --recordings=PATH"
@@ -23,17 +23,19 @@ class Report:
     Attributes:
       passed, failed: how many entries.
       left_out: reason -> how many entries.
+      stopped: groups that raised and files that are unreadable, with what they said; their entries count as failed.
       unexplained: entries that were neither checked nor left out for a stated reason, and files that no check reads.
     """
 
     passed: int = 0
     failed: int = 0
     left_out: collections.Counter = dataclasses.field(default_factory=collections.Counter)
+    stopped: list[str] = dataclasses.field(default_factory=list)
     unexplained: list[str] = dataclasses.field(default_factory=list)
 
     @property
     def ok(self) -> bool:
-        return self.passed > 0 and not self.failed and not self.unexplained
+        return self.passed > 0 and not self.failed and not self.stopped and not self.unexplained
 
     def lines(self) -> list[str]:
         """The summary, a line each."""
@@ -41,6 +43,7 @@ class Report:
         out = [f"{checked} entries checked: {self.passed} passed, {self.failed} failed; "
                f"{sum(self.left_out.values()) + len(self.unexplained)} left out"]
         out += [f"left out, {count}: {reason}" for reason, count in self.left_out.items()]
+        out += [f"stopped: {problem}" for problem in self.stopped]
         return out + [f"left out WITHOUT A REASON: {name}" for name in self.unexplained]
 
 
@@ -56,7 +59,7 @@ def run_folder(folder: pathlib.Path, registry: Sequence[cases.PackChecks], *, on
       write: gets one line for each entry.
 
     Raises:
-      packs.PackError: where the folder holds no pack, or a file is unreadable.
+      packs.PackError: where the folder holds no pack, or pack.json is unreadable. A pack that is counts as failed.
       ValueError: for an unknown name in `only`.
     """
     chosen = _chosen(registry, tuple(only))
@@ -74,52 +77,74 @@ def run_folder(folder: pathlib.Path, registry: Sequence[cases.PackChecks], *, on
     optional = all(checks.needs_recordings for checks, _ in tasks)
     settings = packs.Settings(None if optional and not (folder / "pack.json").exists() else folder)
     for checks, path in tasks:
-        run_pack(checks, cases.Context(packs.Pack(path), settings, recordings), report, write)
+        try:
+            pack = packs.Pack(path)
+        except packs.PackError as error:
+            report.failed += 1
+            report.stopped.append(str(error))
+            write(f"{path.stem:28s} FAIL  ({error})")
+        else:
+            run_pack(checks, cases.Context(pack, settings, recordings), report, write)
     return report
 
 
 def run_pack(checks: cases.PackChecks, context: cases.Context, report: Report, write: Print) -> None:
-    """Checks the entries of one file, adding to `report`."""
+    """Checks the entries of one file, adding to `report`.
+
+    A group that stops does not hide the others. Which entries it would have checked is not known: all that no other
+    group checks fail.
+    """
     done: set[str] = set()
     label = context.pack.path.stem
     skipped = checks.needs_recordings and context.recordings is None
-    problems = []
+    stopped = []
     for group in () if skipped else checks.groups:
         try:
             for check in group(context):
                 if (check.stands_alone or check.entry in context.pack) and check.entry not in done:
                     done.add(check.entry)
                     _record(check, context.pack, label, report, write)
-        except Exception as error:  # one group must not hide the others; its entries are then left out, which fails
-            problems.append(f"{label}: {_name(group)} stopped with {type(error).__name__}: {_first_line(error)}")
+        except Exception as error:
+            stopped.append(f"{_name(group)} stopped with {_said(error)}")
+    report.stopped += [f"{label}: {problem}" for problem in stopped]
     for entry in context.pack.names:
         if entry not in done:
             reason = RECORDINGS_REASON if skipped else checks.reason(entry)
-            if reason is None:
-                report.unexplained.append(f"{label} {entry}")
-            else:
+            if reason is not None:
                 report.left_out[f"{label}: {reason}"] += 1
-    report.unexplained += problems
+            elif stopped:
+                report.failed += 1
+                write(f"{label:28s} {entry:44s} FAIL  ({'; '.join(stopped)})")
+            else:
+                report.unexplained.append(f"{label} {entry}")
 
 
 def _record(check: cases.Check, pack: packs.Pack, label: str, report: Report, write: Print) -> None:
+    """Counts one entry and writes its line; one whose error cannot be computed fails."""
     try:
-        error, note = check.measure(pack, check.entry, check.got), ""
-    except ValueError as wrong_shape:
-        error, note = math.inf, f"  ({wrong_shape})"
-    else:
-        if check.again is not None and error > check.tolerance:
-            computed = error
-            for tries, value in enumerate(check.again(), start=1):
-                error = min(error, check.measure(pack, check.entry, value))
-                if error <= check.tolerance:
-                    note = f"  ({computed:.1e} as first rounded, this in try {tries})"
-                    break
+        error, note = _error(check, pack)
+    except Exception as problem:
+        error, note = math.inf, str(problem) if isinstance(problem, ValueError) else _said(problem)
     passed = error <= check.tolerance
     report.passed += passed
     report.failed += not passed
     write(f"{label:28s} {check.entry:44s} error {error:8.1e}  tolerance {check.tolerance:7.0e}  "
-          f"{'pass' if passed else 'FAIL'}{note}")
+          f"{'pass' if passed else 'FAIL'}{f'  ({note})' if note else ''}")
+
+
+def _error(check: cases.Check, pack: packs.Pack) -> tuple[float, str]:
+    """The error of an entry and what to say of it. Other roundings are asked for only where the first one misses."""
+    first = error = check.measure(pack, check.entry, check.got)
+    if error <= check.tolerance:
+        return error, check.note
+    for tries, value in enumerate(check.again() if check.again else (), start=1):
+        error = min(error, check.measure(pack, check.entry, value))
+        if error <= check.tolerance:
+            return error, f"{first:.1e} as first rounded, this in try {tries}"
+    if check.roundings and rounding.is_near_zero(pack, check.entry, check.tolerance):
+        error, note = rounding.error_near_zero(pack, check.entry, check.roundings(), check.tolerance)
+        return min(first, error), f"{first:.1e} as first rounded; {note}"
+    return error, check.note
 
 
 def _files(folder: pathlib.Path) -> list[pathlib.Path]:
@@ -140,5 +165,5 @@ def _name(group: cases.Group) -> str:
     return getattr(group, "__name__", str(group))
 
 
-def _first_line(error: Exception) -> str:
-    return (str(error).splitlines() or [""])[0]
+def _said(error: Exception) -> str:
+    return f"{type(error).__name__}: {(str(error).splitlines() or [''])[0]}"

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import jax
@@ -19,7 +19,7 @@ import optax
 from muvo_jax import config as config_lib
 from muvo_jax import types
 from muvo_jax.interop import names, packs
-from muvo_jax.interop.parity import cases, drawing, full_models, raw_batch
+from muvo_jax.interop.parity import cases, drawing, full_models, raw_batch, rounding
 from muvo_jax.model import rollout, world_model
 from muvo_jax.objectives import regression, total
 from muvo_jax.training import optimizer as optimizer_lib
@@ -50,19 +50,23 @@ def step(context: cases.Context) -> Checks:
 
 def _step(context: cases.Context) -> Checks:
     latent = "2d" if context.pack.path.stem.endswith("2d") else "1d"
-    frames = context.pack.shape("out/throttle_brake")[1]
+    shape = context.shape("out/throttle_brake", "out/steering", "out/posterior/mu")
+    frames = shape[1] if shape else context.size("p5", f"train_step_{latent}_sequence")
     config = config_lib.ModelConfig(latent=latent, numerics="reference", dropout=0.0, prior_dropout=0.0)
     model = world_model.WorldModel(config)
     variables = jax.tree.map(jnp.asarray, drawing.draw_variables(model.variable_shapes()))
-    batch = raw_batch.model_batch(raw_batch.draw_raw(context, frames, 3))
+    batch = raw_batch.model_batch(raw_batch.draw_raw(context, frames, context.size("p4", "imagine")))
     noise = _noise(context, model, frames)
     loss = loss_config(latent)
 
+    def observe(weights, batch, noise):
+        embedding, updated = model.encode(weights, batch, train=True)
+        return updated, rollout.filter_embeddings(model, weights, embedding, jnp.asarray(batch.action),
+                                                  jnp.asarray(batch.is_first), noise)
+
     def forward(params, batch_stats, batch, noise):
         weights = {"params": params, "batch_stats": batch_stats}
-        embedding, updated = model.encode(weights, batch, train=True)
-        observed = rollout.filter_embeddings(model, weights, embedding, jnp.asarray(batch.action),
-                                             jnp.asarray(batch.is_first), noise)
+        updated, observed = observe(weights, batch, noise)
         predictions: types.Predictions = {}
         for head in config.heads:
             decode = jax.checkpoint(lambda weights, features, head=head: model.decode(weights, features, (head,)))
@@ -74,7 +78,9 @@ def _step(context: cases.Context) -> Checks:
     differentiate = jax.jit(jax.value_and_grad(forward, has_aux=True))
     (_, (terms, updated, observed, predictions)), gradients = differentiate(
         variables["params"], variables["batch_stats"], batch, noise)
-    yield from _terms(terms, predictions, batch, config, loss)
+    yield from _terms(terms, config, loss)
+    yield from _actions(predictions, batch, loss, functools.partial(_moved_predictions, model, observe, variables,
+                                                                    batch, noise))
     yield from _outputs(observed, predictions, config)
     yield from _statistics(context, updated)
     yield from _gradients(context, gradients)
@@ -103,8 +109,31 @@ def _noise(context: cases.Context, model: world_model.WorldModel, frames: int) -
     return types.StepNoise(stack(drawn[0::2]), stack(drawn[1::2]), jnp.zeros((1, frames), bool))
 
 
-def _terms(terms: dict[str, jax.Array], predictions: types.Predictions, batch: types.Batch,
-           config: config_lib.ModelConfig, loss: config_lib.LossConfig) -> Checks:
+def _moved_predictions(model: world_model.WorldModel, observe: Callable[..., Any], variables: Any, batch: types.Batch,
+                       noise: types.StepNoise) -> Iterator[types.Predictions]:
+    """The actions on weights that are moved back and forth."""
+    def act(weights, batch, noise):
+        return model.decode(weights, observe(weights, batch, noise)[1].states.features, ("action",))
+
+    compiled = jax.jit(act)
+    for params in rounding.in_pairs(variables["params"]):
+        yield compiled({**variables, "params": params}, batch, noise)
+
+
+def _actions(predictions: types.Predictions, batch: types.Batch, loss: config_lib.LossConfig,
+             moved: Callable[[], Iterator[types.Predictions]]) -> Checks:
+    """The predicted actions and their loss terms, numbers that may be near zero; `moved` gives their roundings."""
+    for column, entry in enumerate(("throttle_brake", "steering")):
+        pick = lambda action, column=column: jnp.asarray(action)[..., column:column + 1]
+        predicted = lambda predictions, pick=pick: pick(predictions["action"][1])
+        term = lambda predictions, pick=pick: loss.action * regression.l1_sums(pick(predictions["action"][1]),
+                                                                               pick(batch.action)).value()
+        for kind, value in (("out", predicted), ("loss", term)):
+            roundings = lambda value=value: (value(predictions) for predictions in moved())
+            yield cases.Check(f"{kind}/{entry}", value(predictions), LOSS_TOLERANCE, roundings=roundings)
+
+
+def _terms(terms: dict[str, jax.Array], config: config_lib.ModelConfig, loss: config_lib.LossConfig) -> Checks:
     yield cases.Check("loss/total", terms["total"], LOSS_TOLERANCE)
     weights = total.term_weights(loss, config.heads)
     for name, value in terms.items():
@@ -112,17 +141,14 @@ def _terms(terms: dict[str, jax.Array], predictions: types.Predictions, batch: t
         entry = _TERMS.get(name) or f"{_TERMS.get(term, term)}_{scale}"
         if name not in ("total", "action"):
             yield cases.Check(f"loss/{entry}", weights[name] * value, LOSS_TOLERANCE)
-    for column, entry in enumerate(("throttle_brake", "steering")):
-        pick = lambda action, column=column: jnp.asarray(action)[..., column:column + 1]
-        value = regression.l1_sums(pick(predictions["action"][1]), pick(batch.action)).value()
-        yield cases.Check(f"loss/{entry}", loss.action * value, LOSS_TOLERANCE)
 
 
 def _outputs(observed: types.Observed, predictions: types.Predictions, config: config_lib.ModelConfig) -> Checks:
     for kind, gaussian in (("prior", observed.prior), ("posterior", observed.posterior)):
         for entry, value in (("mu", gaussian.mean), ("sigma", gaussian.std)):
             yield cases.Check(f"out/{kind}/{entry}", full_models.latent_layout(value), LOSS_TOLERANCE)
-    for entry, value in full_models.prediction_entries("out", predictions, config):
+    maps = {head: scales for head, scales in predictions.items() if head != "action"}
+    for entry, value in full_models.prediction_entries("out", maps, config):
         yield cases.Check(entry, value, STYLED_TOLERANCE if "voxel" in entry else LOSS_TOLERANCE)
 
 

@@ -9,7 +9,7 @@ import pytest
 
 from muvo_jax import config as config_lib
 from muvo_jax.interop import packs
-from muvo_jax.interop.parity import cases, drawing, full_models, rounding, runner
+from muvo_jax.interop.parity import cases, drawing, full_models, runner
 from muvo_jax.model import decoders
 
 TOLERANCE = 1e-4
@@ -29,7 +29,7 @@ def outcome(pack, check):
 
 
 def roundings(truth, noise=NOISE):
-    """What weights moved back and forth lead to: the move, far larger than the noise, has the opposite sign in turns."""
+    """What weights moved back and forth lead to: moves of opposite sign in turns, far larger than the noise."""
     random = np.random.default_rng(0)
     moves = np.repeat(random.normal(size=8), 2) * np.tile([1e-5, -1e-5], 8)
     return lambda: iter(truth + moves + noise * random.normal(size=16))

@@ -43,7 +43,7 @@ REPORT_FRAMES = 10
 Progress = Callable[[int, int], None]
 
 
-class Job(NamedTuple):
+class TownDrive(NamedTuple):
     """One run to record."""
 
     split: str
@@ -53,7 +53,7 @@ class Job(NamedTuple):
     frames: int
 
 
-def jobs(size: str) -> list[Job]:
+def jobs(size: str) -> list[TownDrive]:
     """All runs of a size, in the order of splits.
 
     Raises:
@@ -61,7 +61,7 @@ def jobs(size: str) -> list[Job]:
     """
     if size not in settings.SIZES:
         raise ValueError(f"town size {size!r} is unknown; known are {', '.join(settings.SIZES)}.")
-    return [Job(split, f"{index:03d}_{plan.weathers[index % len(plan.weathers)]}", plan.first_seed + index,
+    return [TownDrive(split, f"{index:03d}_{plan.weathers[index % len(plan.weathers)]}", plan.first_seed + index,
                 plan.weathers[index % len(plan.weathers)], plan.frames)
             for split, plan in settings.SIZES[size].items() for index in range(plan.runs)]
 
@@ -135,7 +135,7 @@ def describe(directory: pathlib.Path, town_config: settings.TownConfig, splits: 
                                voxels=town_config.voxels)
 
 
-def record_run(directory: pathlib.Path, town: Town, job: Job) -> Iterator[int]:
+def record_run(directory: pathlib.Path, town: Town, job: TownDrive) -> Iterator[int]:
     """Records one run, yielding 1 after each frame. A drive that ends early ends the run early."""
     writer = recorder.RunWriter(directory, job.split, job.run)
     state = town.reset(job.seed, job.weather)
@@ -156,14 +156,14 @@ def record_run(directory: pathlib.Path, town: Town, job: Job) -> Iterator[int]:
     writer.close()
 
 
-def _record_here(directory: pathlib.Path, town_config: settings.TownConfig, missing: list[Job]) -> Iterator[int]:
+def _record_here(directory: pathlib.Path, town_config: settings.TownConfig, missing: list[TownDrive]) -> Iterator[int]:
     if missing:
         town = Town(town_config)
         for job in missing:
             yield from record_run(directory, town, job)
 
 
-def _record_in_workers(directory: pathlib.Path, town_config: settings.TownConfig, missing: list[Job],
+def _record_in_workers(directory: pathlib.Path, town_config: settings.TownConfig, missing: list[TownDrive],
                        workers: int) -> Iterator[int]:
     """Deals the runs out to worker processes and yields the frames they report, a few at a time."""
     environment = {**os.environ, "JAX_PLATFORMS": "cpu", "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
@@ -212,10 +212,10 @@ def _work() -> None:
     town = Town(config_lib.parse(settings.TownConfig, order["town"], "town"))
     for job in order["jobs"]:
         frames = 0
-        for frames, _ in enumerate(record_run(pathlib.Path(order["directory"]), town, Job(*job)), start=1):
+        for frames, _ in enumerate(record_run(pathlib.Path(order["directory"]), town, TownDrive(*job)), start=1):
             if frames % REPORT_FRAMES == 0:
                 _report(REPORT_FRAMES)
-        _report(Job(*job).frames - frames // REPORT_FRAMES * REPORT_FRAMES)
+        _report(TownDrive(*job).frames - frames // REPORT_FRAMES * REPORT_FRAMES)
 
 
 def _report(frames: int) -> None:

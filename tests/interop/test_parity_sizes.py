@@ -1,4 +1,4 @@
-"""Packs of other sizes: what a pack's arrays show goes before pack.json, and that before the sizes of seed 0."""
+"""Golden files of other sizes: what a file's arrays show goes before pack.json, and that before the sizes of seed 0."""
 
 import json
 import pathlib
@@ -6,12 +6,12 @@ import pathlib
 import numpy as np
 import pytest
 
-from muvo_jax.interop import packs
 from muvo_jax.interop.parity import (
     all_losses,
     cases,
     full_models,
     geometry,
+    golden,
     losses,
     modules_1d,
     modules_2d,
@@ -27,20 +27,20 @@ ODD = pathlib.Path(__file__).parents[1] / "golden" / "odd_sizes"
 
 def settings(folder, **sizes):
     (folder / "pack.json").write_text(json.dumps({"format": 1, "seed": 7, **sizes}))
-    return packs.Settings(folder)
+    return golden.Settings(folder)
 
 
 def shapes_only(folder, **shapes):
-    """A context whose pack holds zeros of the given shapes."""
+    """A context whose file holds zeros of the given shapes."""
     np.savez(folder / "p.npz", **{entry.replace("__", "/"): np.zeros(shape, np.float32)
                                   for entry, shape in shapes.items()})
-    return cases.Context(packs.Pack(folder / "p.npz"), settings(folder))
+    return cases.Context(golden.File(folder / "p.npz"), settings(folder))
 
 
 def computed(folder, groups, sizes, more=None):
-    """A pack with what the groups compute for the sizes of pack.json, which are then forgotten."""
+    """A file with what the groups compute for the sizes of pack.json, which are then forgotten."""
     np.savez(folder / "p.npz", **(more or {}))
-    context = cases.Context(packs.Pack(folder / "p.npz"), settings(folder, **sizes))
+    context = cases.Context(golden.File(folder / "p.npz"), settings(folder, **sizes))
     entries = {check.entry: np.asarray(check.got) for group in groups for check in group(context)}
     np.savez(folder / "p.npz", **entries, **(more or {}))
     return entries
@@ -48,8 +48,8 @@ def computed(folder, groups, sizes, more=None):
 
 def check(folder, groups, **sizes):
     report, lines = runner.Report(), []
-    context = cases.Context(packs.Pack(folder / "p.npz"), settings(folder, **sizes))
-    runner.run_pack(cases.PackChecks("p", ("p",), groups), context, report, lines.append)
+    context = cases.Context(golden.File(folder / "p.npz"), settings(folder, **sizes))
+    runner.run_file(cases.FileChecks("p", ("p",), groups), context, report, lines.append)
     assert not report.failed and not report.stopped, "\n".join([*lines, *report.stopped])
     return report
 
@@ -118,7 +118,7 @@ def test_every_loss_term_takes_the_sizes_of_pack_json(tmp_path):
     np.savez(tmp_path / "p5_losses_all_1d.npz")
     sizes = {"p4": {"image_hw": [150, 100], "range_hw": [16, 64], "voxel_xyz": [8, 8, 4]},
              "p5": {"losses_all_sequence": 1, "birdview_hw": [128, 128]}}
-    context = cases.Context(packs.Pack(tmp_path / "p5_losses_all_1d.npz"), settings(tmp_path, **sizes))
+    context = cases.Context(golden.File(tmp_path / "p5_losses_all_1d.npz"), settings(tmp_path, **sizes))
     labels = all_losses._labels(context)
     shapes = {name: labels[f"{name}_1"].shape[-2:] for name in ("range_view_label", "birdview_label")}
     assert shapes == {"range_view_label": (16, 64), "birdview_label": (128, 128)}
@@ -128,5 +128,5 @@ def test_every_loss_term_takes_the_sizes_of_pack_json(tmp_path):
 def test_mobilevit_on_maps_that_are_odd_gives_timms_numbers():
     """timm 1.0.31 on torch 2.13, weights by the rule: an image of 96x160, whose deepest map of 3x5 grows to 4x6."""
     lines = []
-    report = runner.run_folder(ODD, registry.PACKS, write=lines.append)
+    report = runner.run_folder(ODD, registry.FILES, write=lines.append)
     assert report.ok and report.passed == 6, "\n".join(lines)

@@ -8,23 +8,22 @@ import numpy as np
 import pytest
 
 from muvo_jax import config as config_lib
-from muvo_jax.interop import packs
-from muvo_jax.interop.parity import cases, drawing, full_models, runner
+from muvo_jax.interop.parity import cases, drawing, full_models, golden, runner
 from muvo_jax.model import decoders
 
 TOLERANCE = 1e-4
 NOISE = 2e-7
 
 
-def pack_of(folder, **entries):
+def file_of(folder, **entries):
     np.savez(folder / "p.npz", **{name: np.float32(value) for name, value in entries.items()})
-    return packs.Pack(folder / "p.npz")
+    return golden.File(folder / "p.npz")
 
 
-def outcome(pack, check):
+def outcome(file, check):
     report, lines = runner.Report(), []
-    runner.run_pack(cases.PackChecks("p", ("p",), (lambda context: iter([check]),)),
-                    cases.Context(pack, packs.Settings()), report, lines.append)
+    runner.run_file(cases.FileChecks("p", ("p",), (lambda context: iter([check]),)),
+                    cases.Context(file, golden.Settings()), report, lines.append)
     return report.passed == 1, lines[0]
 
 
@@ -43,14 +42,14 @@ def roundings(truth, noise=NOISE):
 ])
 def test_a_number_near_zero_is_compared_in_its_noise(tmp_path, stored, got, passes):
     check = cases.Check("a", np.float32(got), TOLERANCE, roundings=roundings(got))
-    assert outcome(pack_of(tmp_path, a=stored), check)[0] == passes
+    assert outcome(file_of(tmp_path, a=stored), check)[0] == passes
 
 
 def test_noise_that_is_none_of_roundings_excuses_nothing(tmp_path):
     """A function that jumps scatters far more than rounding does."""
-    pack = pack_of(tmp_path, a=3e-4)
+    file = file_of(tmp_path, a=3e-4)
     wild = cases.Check("a", np.float32(3.5e-4), TOLERANCE, roundings=roundings(3.5e-4, noise=1e-3))
-    passed, line = outcome(pack, wild)
+    passed, line = outcome(file, wild)
     assert not passed and "noise 1.0e-06" in line
 
 
@@ -59,9 +58,9 @@ def test_roundings_are_asked_for_only_where_they_can_help(tmp_path):
         raise AssertionError("computed anew for nothing")
 
     large = cases.Check("a", np.float32(0.2), TOLERANCE, roundings=never)
-    assert "AssertionError" not in outcome(pack_of(tmp_path, a=0.1), large)[1]
+    assert "AssertionError" not in outcome(file_of(tmp_path, a=0.1), large)[1]
     small = cases.Check("a", np.float32(1e-4), TOLERANCE, roundings=never)
-    assert outcome(pack_of(tmp_path, a=1e-4), small)[0]
+    assert outcome(file_of(tmp_path, a=1e-4), small)[0]
 
 
 def test_an_action_near_zero_of_a_real_decoder(tmp_path):
@@ -79,17 +78,17 @@ def test_an_action_near_zero_of_a_real_decoder(tmp_path):
         exact = np.maximum(exact, 0) if index < len(layers) - 1 else np.tanh(exact)
     assert np.abs(exact).max() < 1e-3
     for apart, passes in ((0.0, True), (1e-5, False)):
-        pack = pack_of(tmp_path, policy=exact + apart)
-        assert outcome(pack, drawing.action_check("policy", decoder, features, where, TOLERANCE))[0] == passes
+        file = file_of(tmp_path, policy=exact + apart)
+        assert outcome(file, drawing.action_check("policy", decoder, features, where, TOLERANCE))[0] == passes
 
 
 def test_the_choice_of_depth_bins_that_the_pack_made_is_kept_for_what_follows(tmp_path):
-    """An embedding that jumps with a weight's rounding: the first that agrees with the pack is the one that goes on."""
+    """An embedding that jumps with a weight's rounding: the first that agrees with the file is the one that goes on."""
     encode = lambda weights: jnp.where(weights["a"] > 1.0, 2.0, 1.0)[None]
     config = types.SimpleNamespace(camera="bev", latent="1d")
     weights = {"a": np.float32(1.0)}
     for stored in (1.0, 2.0):
-        context = cases.Context(pack_of(tmp_path, embedding=[stored]), packs.Settings())
+        context = cases.Context(file_of(tmp_path, embedding=[stored]), golden.Settings())
         embedding, check = full_models._encoded(context, config, encode, weights)
         np.testing.assert_array_equal(embedding, [stored])
         assert ("as first rounded" in check.note) == (stored == 2.0)

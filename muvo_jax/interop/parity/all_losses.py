@@ -1,4 +1,4 @@
-"""Packs p5_losses_all: every loss term of the reference at once, on given predictions.
+"""Golden files p5_losses_all: every loss term of the reference at once, on given predictions.
 
 Among them are the terms of heads that the released models lack. The two code lines differ in three things: the 2D one
 trains occupancy by its geometric affinity alone, weighs structural similarity half as much, and has a perceptual term.
@@ -40,7 +40,7 @@ _OUTPUTS = {
 
 
 def all_losses(context: cases.Context) -> Checks:
-    line = "2d" if context.pack.path.stem.endswith("2d") else "1d"
+    line = "2d" if context.file.path.stem.endswith("2d") else "1d"
     labels = _labels(context)
     for name, value in _latent_and_action(context, labels["action"]):
         yield cases.Check(f"loss/{name}", value, TOLERANCE)

@@ -1,4 +1,4 @@
-"""What a parity check is made of: checks of entries, groups of them, and the packs that groups belong to."""
+"""What a parity check is made of: checks of entries, groups of them, and the golden files that groups belong to."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import re
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
-from muvo_jax.interop import packs
+from muvo_jax.interop.parity import golden
 
 
 @dataclasses.dataclass(frozen=True)
@@ -16,11 +16,11 @@ class Check:
     """One entry, computed anew.
 
     Attributes:
-      entry: its name in the pack; one that the pack lacks is passed over.
+      entry: its name in the file; one that the file lacks is passed over.
       got: our value, in torch's layout.
       tolerance: the largest error that passes.
-      measure: (pack, entry, got) -> error; by default that of packs.Pack.error.
-      stands_alone: whether the expected value lies elsewhere than in the pack (in `measure`).
+      measure: (file, entry, got) -> error; by default that of golden.File.error.
+      stands_alone: whether the expected value lies elsewhere than in the file (in `measure`).
       again: the same value on weights or inputs that differ by rounding (rounding.anew), asked for only where `got`
         misses the tolerance. At a kink of the function it is chance on which side float32 comes out, in the reference
         too, so one of these may be its value.
@@ -32,7 +32,7 @@ class Check:
     entry: str
     got: Any
     tolerance: float
-    measure: Callable[[packs.Pack, str, Any], float] = packs.Pack.error
+    measure: Callable[[golden.File, str, Any], float] = golden.File.error
     stands_alone: bool = False
     again: Callable[[], Iterator[Any]] | None = None
     roundings: Callable[[], Iterator[Any]] | None = None
@@ -44,13 +44,13 @@ class Context:
     """What a group of checks may read.
 
     Attributes:
-      pack: the file under test.
+      file: the file under test.
       settings: seed and sizes of its folder.
-      recordings: folder of recordings, for the packs that need some.
+      recordings: folder of recordings, for the golden files that need some.
     """
 
-    pack: packs.Pack
-    settings: packs.Settings
+    file: golden.File
+    settings: golden.Settings
     recordings: pathlib.Path | None = None
 
     def draw(self, name: str, shape: tuple[int, ...], kind: str):
@@ -58,20 +58,20 @@ class Context:
         return self.settings.draw(name, shape, kind)
 
     def size(self, *path: str) -> Any:
-        """A size by its place in pack.json, see packs.Settings.size."""
+        """A size by its place in pack.json, see golden.Settings.size."""
         return self.settings.size(*path)
 
     def shape(self, *entries: str) -> tuple[int, ...] | None:
-        """The shape of the first of some entries that the pack holds; what an array shows goes before pack.json."""
-        return next((self.pack.shape(entry) for entry in entries if entry in self.pack), None)
+        """The shape of the first of some entries that the file holds; what an array shows goes before pack.json."""
+        return next((self.file.shape(entry) for entry in entries if entry in self.file), None)
 
 
 Group = Callable[[Context], Iterator[Check]]
 
 
 @dataclasses.dataclass(frozen=True)
-class PackChecks:
-    """How the entries of one kind of pack are computed.
+class FileChecks:
+    """How the entries of one kind of file are computed.
 
     Attributes:
       name: what --only selects.

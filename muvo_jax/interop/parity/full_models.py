@@ -1,4 +1,4 @@
-"""Packs p4: whole models of the reference, from a raw batch to embedding, latents, predictions and dreams."""
+"""Golden files p4: whole models of the reference, from a raw batch to embedding, latents, predictions and dreams."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from muvo_jax import config as config_lib
-from muvo_jax.interop import checkpoints, packs, reference_preprocess
-from muvo_jax.interop.parity import cases, drawing, raw_batch, rounding
+from muvo_jax.interop import checkpoints, reference_preprocess
+from muvo_jax.interop.parity import cases, drawing, golden, raw_batch, rounding
 from muvo_jax.model import rollout, world_model
 from muvo_jax.nn import mobilevit
 from muvo_jax.types import Batch, LatentState, Observed, Predictions, StepNoise
@@ -26,20 +26,20 @@ _BACKBONES = {"encoder": "camera", "range_view_encoder": "lidar"}
 
 
 def config_of(name: str) -> config_lib.ModelConfig:
-    """The configuration of a pack's model, such as "2d_RV_BEV_TR", from the names and shapes of its weights."""
-    unfilled = {key: np.broadcast_to(np.float32(0), shape) for key, shape in packs.manifest(name).items()}
+    """The configuration of a file's model, such as "2d_RV_BEV_TR", from the names and shapes of its weights."""
+    unfilled = {key: np.broadcast_to(np.float32(0), shape) for key, shape in golden.manifest(name).items()}
     return checkpoints.recognise(checkpoints.Stored(pathlib.Path(name), unfilled, {}, {}))
 
 
 def tolerance_of(config: config_lib.ModelConfig, entry: str) -> float:
-    """As the page of the packs says: lifting and adaptive norms, of the 1D voxel head, amplify float32 noise."""
+    """As the page of the golden files says: lifting and adaptive norms, of the 1D voxel head, amplify float32 noise."""
     if config.camera == "bev":
         return BEV_TOLERANCE
     return STYLED_TOLERANCE if "/voxel_" in entry and config.latent == "1d" else TOLERANCE
 
 
 def checks(context: cases.Context) -> Checks:
-    config = config_of(context.pack.path.stem)
+    config = config_of(context.file.path.stem)
     try:
         drawn = drawing.draw_variables(world_model.WorldModel(config).variable_shapes())
         yield from model_checks(context, config, drawn)
@@ -48,12 +48,12 @@ def checks(context: cases.Context) -> Checks:
 
 
 def model_checks(context: cases.Context, config: config_lib.ModelConfig, variables: Any) -> Checks:
-    """The entries of a pack by a model that is given, on the raw batch of the pack.
+    """The entries of a file by a model that is given, on the raw batch of the file.
 
     Args:
-      context: of the pack.
+      context: of the file.
       config: of the model.
-      variables: the pack's weights in our layout.
+      variables: the file's weights in our layout.
     """
     raw = raw_batch.draw_raw(context, *_steps(context))
     frames = raw["image"].shape[1]
@@ -85,10 +85,10 @@ def model_checks(context: cases.Context, config: config_lib.ModelConfig, variabl
 
 
 def _steps(context: cases.Context) -> tuple[int, int]:
-    """How many frames a pack observes, and how many steps it imagines."""
+    """How many frames a file observes, and how many steps it imagines."""
     embedding, dreamt = context.shape("embedding"), context.shape("imagine/action", "imagine_policy/action")
     sequence = context.size("p4", "sequence")
-    usual = sequence.get(context.pack.path.stem, sequence["default"]) if embedding is None else embedding[1]
+    usual = sequence.get(context.file.path.stem, sequence["default"]) if embedding is None else embedding[1]
     return usual, context.size("p4", "imagine") if dreamt is None else dreamt[1]
 
 
@@ -97,12 +97,12 @@ def _encoded(context: cases.Context, config: config_lib.ModelConfig, encode: Cal
     """The embedding from which all else follows, and its check.
 
     A camera "bev" chooses the most probable bins of depth: a jump where two of them tie. Where ours misses, the choices
-    of weights that differ by rounding are tried, and the first that agrees with the pack is kept.
+    of weights that differ by rounding are tried, and the first that agrees with the file is kept.
     """
     tolerance, note = tolerance_of(config, "embedding"), ""
     embedding = encode(variables)
-    if config.camera == "bev" and "embedding" in context.pack:
-        error = lambda value: context.pack.error("embedding", latent_layout(value))
+    if config.camera == "bev" and "embedding" in context.file:
+        error = lambda value: context.file.error("embedding", latent_layout(value))
         first = error(embedding)
         others = rounding.anew(variables, size=rounding.NETWORK_NOISE) if first > tolerance else ()
         for tries, moved in enumerate(others, start=1):
@@ -132,11 +132,11 @@ def _entries(context: cases.Context, model: world_model.WorldModel, variables: A
             yield f"out/{kind}/{entry}", latent_layout(value)
     yield from prediction_entries("out", rollout.decode(model, variables, observed.states, heads), model.config)
     dream = functools.partial(_dream, model, variables, observed.last, horizon=actions.shape[1], heads=heads)
-    if "imagine/state" in context.pack:
+    if "imagine/state" in context.file:
         yield from dream(actions, "imagine")
-    if "imagine_policy/state" in context.pack:
+    if "imagine_policy/state" in context.file:
         yield from dream(rollout.learned_policy(model, variables), "imagine_policy")
-    if "deployment/steering" in context.pack:
+    if "deployment/steering" in context.file:
         yield from _deployed(model, variables, embedding, batch, observed.last)
 
 

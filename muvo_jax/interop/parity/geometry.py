@@ -1,4 +1,4 @@
-"""Pack p2_geometry: positions of tokens, cameras, the range view, and the preprocessing of the network's inputs."""
+"""File p2_geometry: positions of tokens, cameras, the range view, and the preprocessing of the network's inputs."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ from collections.abc import Iterator
 import numpy as np
 
 from muvo_jax import config as config_lib
-from muvo_jax.interop import packs, reference_preprocess
-from muvo_jax.interop.parity import cases, pooling, recordings
+from muvo_jax.interop import reference_preprocess
+from muvo_jax.interop.parity import cases, golden, pooling, recordings, rounding
 from muvo_jax.nn import attention
 from muvo_jax.ops import range_view
 
@@ -19,7 +19,7 @@ TOLERANCE, SHARE_TOLERANCE = 1e-5, 1e-4
 
 def positions(context: cases.Context) -> Checks:
     """Sine embeddings; the name says channels of an axis and the grid, as in pos2d/a_192_10x26."""
-    for entry in context.pack.names:
+    for entry in context.file.names:
         match = re.fullmatch(r"pos[23]d/(?:[a-z]_)?(\d+)_(\d+(?:x\d+)+)", entry)
         if match:
             grid = tuple(int(side) for side in match[2].split("x"))
@@ -49,21 +49,26 @@ def cameras(context: cases.Context) -> Checks:
         yield cases.Check(f"camera/{entry}", value, TOLERANCE)
     cells = (context.shape("camera/out_of_view_mask") or context.size("p2", "birdview_hw"))[0]
     mask = reference_preprocess.out_of_view(size, cells)
-    yield cases.Check("camera/out_of_view_mask", mask, SHARE_TOLERANCE, packs.Pack.share_different)
+    yield cases.Check("camera/out_of_view_mask", mask, SHARE_TOLERANCE, golden.File.share_different)
 
 
 def projection(context: cases.Context) -> Checks:
-    """The nearest return of each pixel; a point on the edge of a pixel may fall on either side of it."""
+    """The nearest return of each pixel; a point on the edge of a pixel may fall on either side of it.
+
+    The reference's points are float64, ours float32.
+    """
     rows, columns = context.shape("range/depth") or context.size("p2", "range_hw")
     cloud = context.draw("rv_cloud", (context.size("p2", "cloud_points"),), "cloud")
-    view = range_view.project(cloud, config_lib.RangeViewGeometry(rows=rows, columns=columns))
-    yield cases.Check("range/depth", view[..., 3], SHARE_TOLERANCE, _share_apart)
-    yield cases.Check("range/xyz", view[..., :3], SHARE_TOLERANCE, _share_apart)
+    geometry = config_lib.RangeViewGeometry(rows=rows, columns=columns)
+    view = range_view.project(cloud, geometry)
+    for entry, part in (("range/depth", 3), ("range/xyz", slice(3))):
+        again = lambda part=part: (range_view.project(moved, geometry)[..., part] for moved in rounding.anew(cloud))
+        yield cases.Check(entry, view[..., part], SHARE_TOLERANCE, _share_apart, again=again)
 
 
-def _share_apart(pack: packs.Pack, entry: str, got: np.ndarray) -> float:
+def _share_apart(file: golden.File, entry: str, got: np.ndarray) -> float:
     """Share of the stored values that are off by more than the tolerance of floats."""
-    want, have = pack.stored(entry, got)
+    want, have = file.stored(entry, got)
     return float((np.abs(want - have) > TOLERANCE * np.abs(want).max()).mean())
 
 

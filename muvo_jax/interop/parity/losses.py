@@ -1,4 +1,4 @@
-"""Pack p1_losses_metrics: losses with their gradients, and metrics.
+"""File p1_losses_metrics: losses with their gradients, and metrics.
 
 Inputs are drawn in torch's layout; the gradient is taken with respect to the input in that layout, so that the change
 of layout is part of what is differentiated.

@@ -1,4 +1,4 @@
-"""Pack p3_modules_1d: the parts of the reference's 1D model, in evaluation mode."""
+"""File p3_modules_1d: the parts of the reference's 1D model, in evaluation mode."""
 
 from __future__ import annotations
 
@@ -78,7 +78,7 @@ def measurements(context: cases.Context) -> Checks:
     speed = context.draw("speed", (count, 1), "speed") / CONFIG.speed_scale_mps
     out = drawing.run(layers.Mlp((CONFIG.measurement_channels,) * 2), speed, where="speed/mlp/")
     yield cases.Check("speed_enc/out", jax.nn.relu(out), TOLERANCE)
-    # The pack feeds a map that is normalised already, of three different channels: enter behind the normalisation.
+    # The file feeds a map that is normalised already, of three different channels: enter behind the normalisation.
     count, *_ = context.shape("backbone_route/out") or (2,)
     route = drawing.channels_last(context.draw("route", (count, 3, *context.size("p3_1d", "route_hw")), "smooth_pm1"))
     (deepest,) = drawing.run(resnet.ResNet18(CONFIG.backbone_width, (4,)), route, prefix="backbone_route.backbone.",
@@ -140,7 +140,7 @@ def transition_checks(context: cases.Context, config: config_lib.ModelConfig, na
       batch, steps, imagined: sizes.
       embedding: [batch, steps, ...].
       rename: applied to the reference's keys.
-      moved: brings a latent [B, T, ...] into the layout of the pack.
+      moved: brings a latent [B, T, ...] into the layout of the file.
     """
     model = world_model.WorldModel(config)
     shapes = model.variable_shapes()["params"]["transition"]

@@ -1,4 +1,4 @@
-"""Pack p3_modules_2d: the parts of the reference's 2D model, in evaluation mode."""
+"""File p3_modules_2d: the parts of the reference's 2D model, in evaluation mode."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from muvo_jax.nn import resnet
 
 TOLERANCE, STYLED_TOLERANCE = modules_1d.TOLERANCE, modules_1d.STYLED_TOLERANCE
 CONFIG = config_lib.ModelConfig(latent="2d", numerics="reference")
-NARROW = dataclasses.replace(CONFIG, token_channels=48)  # the pack's small transition: 48 channels everywhere
+NARROW = dataclasses.replace(CONFIG, token_channels=48)  # the file's small transition: 48 channels everywhere
 Checks = Iterator[cases.Check]
 
 
@@ -77,7 +77,7 @@ def decoded(context: cases.Context) -> Checks:
             yield cases.Check(f"{name}/{entry}_{scale}", drawing.channels_first(value), tolerance)
     channels = heads.TABLE["birds_eye"].channels_of(CONFIG)
     birds_eye = token_decoders.TokenDecoder(channels, width, width, 1, head=decoders.BirdsEyeHead)
-    # The pack feeds the ground plan itself.
+    # The file feeds the ground plan itself.
     grid = _grid(context, "bev_decoder/bev_segmentation_1", 16) or (12, 12)
     plan = drawing.channels_last(context.draw("bev_decoder_in", (1, CONFIG.token_channels, *grid), "normal"))
     for entry, value in drawing.birds_eye_entries("bev_decoder", drawing.run(

@@ -1,4 +1,4 @@
-"""Pack p6: what the authors' CarlaDataset picks and reads from recordings in the MUVO layout, against our reader.
+"""File p6: what the authors' CarlaDataset picks and reads from recordings in the MUVO layout, against our reader.
 
 p6_pointers.json says which frames their class picks, under which settings, and p6_dataset.npz what it reads. All is
 computed again from the recordings: the range view by ops/range_view.py in float32, all else exactly. Where the authors
@@ -20,8 +20,7 @@ import numpy as np
 import scipy.ndimage
 
 from muvo_jax.data import carla, carla_files, carla_runs, files, schema
-from muvo_jax.interop import packs
-from muvo_jax.interop.parity import cases
+from muvo_jax.interop.parity import cases, golden
 from muvo_jax.ops import camera as camera_ops
 from muvo_jax.ops import range_view as range_view_ops
 
@@ -38,17 +37,17 @@ class _Recordings:
     """What both groups read first.
 
     Raises:
-      PackError: where p6_pointers.json is missing or unreadable.
+      GoldenError: where p6_pointers.json is missing or unreadable.
       DataError: where the recordings are.
     """
 
     def __init__(self, context: cases.Context):
         assert context.recordings is not None
-        path = context.pack.path.with_name(POINTERS_FILE)
+        path = context.file.path.with_name(POINTERS_FILE)
         try:
             self.expected = json.loads(path.read_text(encoding="utf-8"))
         except (OSError, ValueError) as error:
-            raise packs.PackError(f"{path}: expected the pointers of the pack ({error}).") from error
+            raise golden.GoldenError(f"{path}: expected the pointers of the file ({error}).") from error
         self.config = self.expected["config"]
         self.runs = carla_runs.find_runs(context.recordings)
 
@@ -219,32 +218,32 @@ def _out_of_view(config: Mapping) -> np.ndarray:
     return np.concatenate([hidden, np.ones((behind, side), bool)])
 
 
-def _different(pack: packs.Pack, entry: str, got: np.ndarray) -> float:
+def _different(file: golden.File, entry: str, got: np.ndarray) -> float:
     """0 where equal: by checksum where there is one, else by all stored values. Minus zero equals zero."""
-    checksum = pack.arrays.get(f"{entry}::crc32")
+    checksum = file.arrays.get(f"{entry}::crc32")
     if checksum is not None:
         if zlib.crc32(np.ascontiguousarray(got.astype(np.int64)).tobytes()) == int(checksum[0]):
             return 0.0
-        return max(_share(pack, entry, got), 1.0 / max(got.size, 1))
-    return _share(pack, entry, got)
+        return max(_share(file, entry, got), 1.0 / max(got.size, 1))
+    return _share(file, entry, got)
 
 
-def _share(pack: packs.Pack, entry: str, got: np.ndarray) -> float:
+def _share(file: golden.File, entry: str, got: np.ndarray) -> float:
     """Of the values stored, those that differ; all where there are not as many of them."""
     try:
-        return pack.share_different(entry, got)
+        return file.share_different(entry, got)
     except ValueError:
         return 1.0
 
 
-def _absolute(pack: packs.Pack, entry: str, got: np.ndarray) -> float:
-    stored = pack.arrays[entry] if entry in pack.arrays else pack.arrays[f"{entry}::sub"]
-    have = got if entry in pack.arrays else got.reshape(-1)[::int(pack.arrays[f"{entry}::meta"][0])]
+def _absolute(file: golden.File, entry: str, got: np.ndarray) -> float:
+    stored = file.arrays[entry] if entry in file.arrays else file.arrays[f"{entry}::sub"]
+    have = got if entry in file.arrays else got.reshape(-1)[::int(file.arrays[f"{entry}::meta"][0])]
     return float(np.abs(have.astype(np.float64) - stored).max(initial=0.0))
 
 
 # How far an entry may be off; what is not named must be equal.
-_MEASURES = {"intrinsics": (1e-6, packs.Pack.error), "depth": (1e-7, _absolute), "depth_color": (1e-7, _absolute)}
+_MEASURES = {"intrinsics": (1e-6, golden.File.error), "depth": (1e-7, _absolute), "depth_color": (1e-7, _absolute)}
 
 
 def _range_view(batch: str, ours: np.ndarray) -> Checks:
@@ -255,18 +254,18 @@ def _range_view(batch: str, ours: np.ndarray) -> Checks:
     flat = ours.transpose(0, 2, 3, 1).reshape(-1, 4)
     mine = np.flatnonzero(flat[:, 3] >= 0)
 
-    def pixels(pack: packs.Pack, entry: str, got: np.ndarray) -> float:
-        return len(np.setxor1d(got, pack[entry])) / max(len(pack[entry]), 1)
+    def pixels(file: golden.File, entry: str, got: np.ndarray) -> float:
+        return len(np.setxor1d(got, file[entry])) / max(len(file[entry]), 1)
 
-    def values(pack: packs.Pack, entry: str, got: np.ndarray) -> float:
-        theirs = pack[f"{batch}/range_view@pixels"]
+    def values(file: golden.File, entry: str, got: np.ndarray) -> float:
+        theirs = file[f"{batch}/range_view@pixels"]
         both = np.isin(theirs, mine)
-        off_m = np.abs(got[theirs[both]] - pack[entry][both])
+        off_m = np.abs(got[theirs[both]] - file[entry][both])
         return float(((off_m[:, :3].max(axis=1) > _XYZ_M) | (off_m[:, 3] > _RANGE_M)).mean()) if len(off_m) else 1.0
 
-    def image(pack: packs.Pack, entry: str, got: np.ndarray) -> float:
-        stored = pack.arrays[f"{entry}::sub"]
-        have = got.reshape(-1)[::int(pack.arrays[f"{entry}::meta"][0])]
+    def image(file: golden.File, entry: str, got: np.ndarray) -> float:
+        stored = file.arrays[f"{entry}::sub"]
+        have = got.reshape(-1)[::int(file.arrays[f"{entry}::meta"][0])]
         return float((np.abs(have - stored) > _RANGE_M).mean())
 
     yield cases.Check(f"{batch}/range_view@pixels", mine, _PIXEL_SHARE, pixels)

@@ -1,4 +1,4 @@
-"""Pack p2_geometry, pooling into cells of the ground: image features along their rays, and points in pillars."""
+"""File p2_geometry, pooling into cells of the ground: image features along their rays, and points in pillars."""
 
 from __future__ import annotations
 
@@ -10,9 +10,8 @@ import numpy as np
 
 from muvo_jax import config as config_lib
 from muvo_jax.geometry import BirdsEyeGrid
-from muvo_jax.interop import packs
 from muvo_jax.interop import reference_preprocess as preprocess
-from muvo_jax.interop.parity import cases, drawing, rounding
+from muvo_jax.interop.parity import cases, drawing, golden, rounding
 from muvo_jax.model import lidar
 from muvo_jax.nn import norm
 from muvo_jax.ops import frustum, resample
@@ -99,7 +98,7 @@ def point_pillars(context: cases.Context) -> Checks:
     net = lidar.PillarNet(config_lib.ModelConfig(numerics="reference"))
     shapes = jax.eval_shape(lambda key: net.init(key, points, count, drawing.EVAL), jax.random.key(0))
     variables = drawing.draw_variables(shapes, where="lidar/pillars/")
-    occupied = context.pack["pillars/occupied_flat"]
+    occupied = context.file["pillars/occupied_flat"]
     for tag, mode in (("pillars", drawing.EVAL), ("pillars_trainmode", norm.Mode(train=True))):
         canvas, _ = net.apply(variables, points, count, mode, mutable=["batch_stats"])
         flat = np.asarray(canvas).reshape(-1, canvas.shape[-1])
@@ -109,9 +108,9 @@ def point_pillars(context: cases.Context) -> Checks:
             yield cases.Check(f"{tag}/occupied_flat", np.flatnonzero(flat.any(axis=1)), SHARE_TOLERANCE, _cells_apart)
 
 
-def _cells_apart(pack: packs.Pack, entry: str, got: np.ndarray) -> float:
+def _cells_apart(file: golden.File, entry: str, got: np.ndarray) -> float:
     """Share of the pillars that only one of the two sides has."""
-    return len(np.setxor1d(pack[entry], got)) / len(pack[entry])
+    return len(np.setxor1d(file[entry], got)) / len(file[entry])
 
 
 GROUPS: tuple[cases.Group, ...] = (frusta, point_pillars)

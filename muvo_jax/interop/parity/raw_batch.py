@@ -1,6 +1,6 @@
-"""The raw batch of packs p4 and p5 (what the authors' dataset gives), and the same as our model reads it.
+"""The raw batch of golden files p4 and p5 (what the authors' dataset gives), and the same as our model reads it.
 
-Sizes are those of the arrays that a pack stores of it, or else those of p4 in pack.json.
+Sizes are those of the arrays that a file stores of it, or else those of p4 in pack.json.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Pack p2_geometry, the part of the data tools: points, voxels, images of the simulator, bird's-eye views, GPS."""
+"""File p2_geometry, the part of the data tools: points, voxels, images of the simulator, bird's-eye views, GPS."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ import numpy as np
 
 from muvo_jax import config as config_lib
 from muvo_jax.data import carla_files, schema
-from muvo_jax.interop import packs, reference_data
+from muvo_jax.interop import reference_data
 from muvo_jax.interop import reference_preprocess as preprocess
-from muvo_jax.interop.parity import cases
+from muvo_jax.interop.parity import cases, golden, rounding
 from muvo_jax.ops import camera, range_view, voxels
 
 Checks = Iterator[cases.Check]
@@ -37,16 +37,21 @@ def range_views(context: cases.Context) -> Checks:
     geometry = config_lib.RangeViewGeometry(rows=rows, columns=columns)
     cloud = _cloud(context)
     tags = context.draw("rv_sem", (len(cloud),), "ints9").astype(np.uint8)
-    winner = range_view.nearest_points(cloud, geometry)
-    yield cases.Check("range/sem", np.where(winner >= 0, tags[winner], 0), SHARE_TOLERANCE, _known_apart)
+
+    def nearest_tags(cloud: np.ndarray) -> np.ndarray:
+        winner = range_view.nearest_points(cloud, geometry)
+        return np.where(winner >= 0, tags[winner], 0)
+
+    again = lambda: (nearest_tags(moved) for moved in rounding.anew(cloud))
+    yield cases.Check("range/sem", nearest_tags(cloud), SHARE_TOLERANCE, _known_apart, again=again)
     shape = context.shape("restore_pcd") or (1, 2, rows, columns, 4)
     depth = 60 * context.draw("restore_depth", shape[:-1], "smooth")
     geometry = config_lib.RangeViewGeometry(rows=shape[2], columns=shape[3])
     yield cases.Check("restore_pcd", reference_data.pixel_corner_points(depth, geometry), TOLERANCE)
 
 
-def _known_apart(pack: packs.Pack, entry: str, got: np.ndarray) -> float:
-    return pack.share_different(entry, got, pack["range/label_ambiguous"])
+def _known_apart(file: golden.File, entry: str, got: np.ndarray) -> float:
+    return file.share_different(entry, got, file["range/label_ambiguous"])
 
 
 def depth_images(context: cases.Context) -> Checks:
@@ -56,7 +61,7 @@ def depth_images(context: cases.Context) -> Checks:
     in_camera = np.stack([-points[:, 1], -points[:, 2], points[:, 0]], axis=1)
     yield cases.Check("depth2pcd/n", np.array(points.shape), 0.0)
     yield cases.Check("depth2pcd/points", in_camera, TOLERANCE)
-    yield cases.Check("depth2pcd/sem", tags.reshape(-1, 1)[pixel], SHARE_TOLERANCE, packs.Pack.share_different)
+    yield cases.Check("depth2pcd/sem", tags.reshape(-1, 1)[pixel], SHARE_TOLERANCE, golden.File.share_different)
     in_ego, _ = camera.reference_depth_points(depth, _FIELD_OF_VIEW_RAD, preprocess.CAMERA_POSITION_M)
     yield cases.Check("convert_coor_img", in_ego, TOLERANCE)
     wanted = context.shape("convert_coor_lidar") or context.size("p2", "converted_points_xyz")
@@ -65,7 +70,7 @@ def depth_images(context: cases.Context) -> Checks:
     pixels = context.draw("carla_bgra", (*size, 4), "ints256")
     depth_m = carla_files.DEPTH_RANGE_M * carla_files.decode_depth(pixels[..., 2::-1])
     yield cases.Check("carla_decode/depth_m", depth_m, TOLERANCE)
-    yield cases.Check("carla_decode/sem", pixels[..., 3], 0.0, packs.Pack.share_different)
+    yield cases.Check("carla_decode/sem", pixels[..., 3], 0.0, golden.File.share_different)
     yield cases.Check("label_map", carla_files.is_occupied(np.arange(23)).astype(np.uint8), 0.0)
 
 
@@ -81,7 +86,7 @@ def fused_voxels(context: cases.Context) -> Checks:
     points, tags = points[keep], tags[keep]
     yield cases.Check("merge/n", np.array(points.shape), 0.0)
     yield cases.Check("merge/points", points, TOLERANCE)
-    yield cases.Check("merge/sem", tags[:, None], SHARE_TOLERANCE, packs.Pack.share_different)
+    yield cases.Check("merge/sem", tags[:, None], SHARE_TOLERANCE, golden.File.share_different)
     table = voxels.voxel_table(points, tags, _GRID, winning_tag=carla_files.ROAD_LINE)
     yield cases.Check("voxel_filter/coords", table, SHARE_TOLERANCE, _voxels_apart)
     yield cases.Check("voxel_filter/sem", table, SHARE_TOLERANCE, _voxel_tags_apart)
@@ -91,18 +96,18 @@ def _numbers(coordinates: np.ndarray) -> np.ndarray:
     return np.ravel_multi_index(tuple(coordinates.astype(np.int64).T), _GRID.shape)
 
 
-def _voxels_apart(pack: packs.Pack, entry: str, table: np.ndarray) -> float:
+def _voxels_apart(file: golden.File, entry: str, table: np.ndarray) -> float:
     """Share of the voxels that only one of the two sides has."""
-    want = _numbers(pack[entry])
+    want = _numbers(file[entry])
     return len(np.setxor1d(want, _numbers(table[:, :3]))) / len(want)
 
 
-def _voxel_tags_apart(pack: packs.Pack, entry: str, table: np.ndarray) -> float:
+def _voxel_tags_apart(file: golden.File, entry: str, table: np.ndarray) -> float:
     """Share of the voxels of both sides that have another tag, where the nearest point is no matter of taste."""
-    _, ours, theirs = np.intersect1d(_numbers(table[:, :3]), _numbers(pack["voxel_filter/coords"]),
+    _, ours, theirs = np.intersect1d(_numbers(table[:, :3]), _numbers(file["voxel_filter/coords"]),
                                      assume_unique=True, return_indices=True)
-    known = ~pack["voxel_filter/label_ambiguous"][theirs]
-    return float((table[ours, 3] != pack[entry][theirs])[known].mean())
+    known = ~file["voxel_filter/label_ambiguous"][theirs]
+    return float((table[ours, 3] != file[entry][theirs])[known].mean())
 
 
 def point_histograms(context: cases.Context) -> Checks:

@@ -11,7 +11,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from muvo_jax.interop import packs
+from muvo_jax.interop.parity import golden
 
 NETWORK_NOISE = 1e-6  # what a deep network makes of its own rounding, where its numbers are of size 1
 _DEVIATIONS = 4.0  # of the noise that two roundings of one number may lie apart
@@ -20,7 +20,7 @@ _DEVIATIONS = 4.0  # of the noise that two roundings of one number may lie apart
 def anew(values: Any, tries: int = 32, size: float = 1e-7) -> Iterator[Any]:
     """A tree of arrays as rounding could have left them: times 1 + size N(0, 1).
 
-    The noise of the packs was measured with 1e-7.
+    The noise of the golden files was measured with 1e-7.
     """
     return (_moved(values, seed, size) for seed in range(tries))
 
@@ -40,12 +40,12 @@ def _moved(values: Any, seed: int, size: float) -> Any:
     return jax.tree.map(move, values)
 
 
-def is_near_zero(pack: packs.Pack, entry: str, tolerance: float) -> bool:
+def is_near_zero(file: golden.File, entry: str, tolerance: float) -> bool:
     """Whether the noise of a network is more than the tolerance of the largest number of an entry stored whole."""
-    return entry in pack.arrays and tolerance * np.abs(pack[entry]).max(initial=0.0) < NETWORK_NOISE
+    return entry in file.arrays and tolerance * np.abs(file[entry]).max(initial=0.0) < NETWORK_NOISE
 
 
-def error_near_zero(pack: packs.Pack, entry: str, values: Iterator[Any], tolerance: float) -> tuple[float, str]:
+def error_near_zero(file: golden.File, entry: str, values: Iterator[Any], tolerance: float) -> tuple[float, str]:
     """The error of an entry near zero in the mean of its roundings, and how it came about in words.
 
     The difference is measured against the stored magnitude, as everywhere, or against that number of which the noise of
@@ -58,7 +58,7 @@ def error_near_zero(pack: packs.Pack, entry: str, values: Iterator[Any], toleran
     every = np.stack([np.asarray(value, np.float64) for value in values])
     pairs = every.reshape(-1, 2, *every.shape[1:]).mean(axis=1)
     noise = min(float(np.sqrt(2.0) * pairs.std(axis=0, ddof=1).max()), NETWORK_NOISE)
-    stored, mean = pack.stored(entry, pairs.mean(axis=0))
+    stored, mean = file.stored(entry, pairs.mean(axis=0))
     apart = float(np.abs(mean - stored).max())
     magnitude = max(float(np.abs(stored).max()), _DEVIATIONS * noise / tolerance)
     return apart / magnitude, f"near zero: {apart:.1e} from the mean of {len(every)} roundings, noise {noise:.1e}"

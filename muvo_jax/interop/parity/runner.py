@@ -1,4 +1,4 @@
-"""Runs the checks of a folder of packs and counts what passed, failed and was left out."""
+"""Runs the checks of a folder of golden files and counts what passed, failed and was left out."""
 
 from __future__ import annotations
 
@@ -8,8 +8,7 @@ import math
 import pathlib
 from collections.abc import Callable, Iterable, Sequence
 
-from muvo_jax.interop import packs
-from muvo_jax.interop.parity import cases, rounding
+from muvo_jax.interop.parity import cases, golden, rounding
 
 Print = Callable[[str], None]
 RECORDINGS_REASON = "needs recordings: give their folder with --recordings=PATH"
@@ -47,19 +46,20 @@ class Report:
         return out + [f"left out WITHOUT A REASON: {name}" for name in self.unexplained]
 
 
-def run_folder(folder: pathlib.Path, registry: Sequence[cases.PackChecks], *, only: Iterable[str] = (),
+def run_folder(folder: pathlib.Path, registry: Sequence[cases.FileChecks], *, only: Iterable[str] = (),
                recordings: pathlib.Path | None = None, write: Print = print) -> Report:
-    """Checks every pack in a folder, and in its subfolder p4_full.
+    """Checks every file in a folder, and in its subfolder p4_full.
 
     Args:
-      folder: holds npz files and pack.json; a folder with packs of recordings alone needs no pack.json.
-      registry: all packs that can be checked.
-      only: names of packs or their beginnings ("p3" stands for p3_1d and p3_2d); none means all.
-      recordings: folder of recordings, for the packs that need some.
+      folder: holds npz files and pack.json; a folder with golden files of recordings alone needs no pack.json.
+      registry: all kinds of golden files that can be checked.
+      only: names of kinds or their beginnings ("p3" stands for p3_1d and p3_2d); none means all.
+      recordings: folder of recordings, for the golden files that need some.
       write: gets one line for each entry.
 
     Raises:
-      packs.PackError: where the folder holds no pack, or pack.json is unreadable. A pack that is counts as failed.
+      golden.GoldenError: where the folder holds no golden file, or pack.json is unreadable. An unreadable golden file
+        counts as failed.
       ValueError: for an unknown name in `only`.
     """
     chosen = _chosen(registry, tuple(only))
@@ -72,42 +72,42 @@ def run_folder(folder: pathlib.Path, registry: Sequence[cases.PackChecks], *, on
             tasks.append((checks, path))
     tasks.sort(key=lambda task: registry.index(task[0]))
     if not tasks:
-        raise packs.PackError(f"{folder}: expected packs such as p1_losses_metrics.npz, found none"
+        raise golden.GoldenError(f"{folder}: expected golden files such as p1_losses_metrics.npz, found none"
                               f"{' of ' + ', '.join(only) if only else ''}.")
     optional = all(checks.needs_recordings for checks, _ in tasks)
-    settings = packs.Settings(None if optional and not (folder / "pack.json").exists() else folder)
+    settings = golden.Settings(None if optional and not (folder / "pack.json").exists() else folder)
     for checks, path in tasks:
         try:
-            pack = packs.Pack(path)
-        except packs.PackError as error:
+            file = golden.File(path)
+        except golden.GoldenError as error:
             report.failed += 1
             report.stopped.append(str(error))
             write(f"{path.stem:28s} FAIL  ({error})")
         else:
-            run_pack(checks, cases.Context(pack, settings, recordings), report, write)
+            run_file(checks, cases.Context(file, settings, recordings), report, write)
     return report
 
 
-def run_pack(checks: cases.PackChecks, context: cases.Context, report: Report, write: Print) -> None:
+def run_file(checks: cases.FileChecks, context: cases.Context, report: Report, write: Print) -> None:
     """Checks the entries of one file, adding to `report`.
 
     A group that stops does not hide the others. Which entries it would have checked is not known: all that no other
     group checks fail.
     """
     done: set[str] = set()
-    label = context.pack.path.stem
+    label = context.file.path.stem
     skipped = checks.needs_recordings and context.recordings is None
     stopped = []
     for group in () if skipped else checks.groups:
         try:
             for check in group(context):
-                if (check.stands_alone or check.entry in context.pack) and check.entry not in done:
+                if (check.stands_alone or check.entry in context.file) and check.entry not in done:
                     done.add(check.entry)
-                    _record(check, context.pack, label, report, write)
+                    _record(check, context.file, label, report, write)
         except Exception as error:
             stopped.append(f"{_name(group)} stopped with {_said(error)}")
     report.stopped += [f"{label}: {problem}" for problem in stopped]
-    for entry in context.pack.names:
+    for entry in context.file.names:
         if entry not in done:
             reason = RECORDINGS_REASON if skipped else checks.reason(entry)
             if reason is not None:
@@ -119,10 +119,10 @@ def run_pack(checks: cases.PackChecks, context: cases.Context, report: Report, w
                 report.unexplained.append(f"{label} {entry}")
 
 
-def _record(check: cases.Check, pack: packs.Pack, label: str, report: Report, write: Print) -> None:
+def _record(check: cases.Check, file: golden.File, label: str, report: Report, write: Print) -> None:
     """Counts one entry and writes its line; one whose error cannot be computed fails."""
     try:
-        error, note = _error(check, pack)
+        error, note = _error(check, file)
     except Exception as problem:
         error, note = math.inf, str(problem) if isinstance(problem, ValueError) else _said(problem)
     passed = error <= check.tolerance
@@ -132,28 +132,29 @@ def _record(check: cases.Check, pack: packs.Pack, label: str, report: Report, wr
           f"{'pass' if passed else 'FAIL'}{f'  ({note})' if note else ''}")
 
 
-def _error(check: cases.Check, pack: packs.Pack) -> tuple[float, str]:
+def _error(check: cases.Check, file: golden.File) -> tuple[float, str]:
     """The error of an entry and what to say of it. Other roundings are asked for only where the first one misses."""
-    first = error = check.measure(pack, check.entry, check.got)
+    first = error = check.measure(file, check.entry, check.got)
     if error <= check.tolerance:
         return error, check.note
     for tries, value in enumerate(check.again() if check.again else (), start=1):
-        error = min(error, check.measure(pack, check.entry, value))
+        error = min(error, check.measure(file, check.entry, value))
         if error <= check.tolerance:
             return error, f"{first:.1e} as first rounded, this in try {tries}"
-    if check.roundings and rounding.is_near_zero(pack, check.entry, check.tolerance):
-        error, note = rounding.error_near_zero(pack, check.entry, check.roundings(), check.tolerance)
+    if check.roundings and rounding.is_near_zero(file, check.entry, check.tolerance):
+        error, note = rounding.error_near_zero(file, check.entry, check.roundings(), check.tolerance)
         return min(first, error), f"{first:.1e} as first rounded; {note}"
     return error, check.note
 
 
 def _files(folder: pathlib.Path) -> list[pathlib.Path]:
     if not folder.is_dir():
-        raise packs.PackError(f"{folder}: expected a folder of packs, found {'a file' if folder.exists() else 'none'}.")
+        found = "a file" if folder.exists() else "none"
+        raise golden.GoldenError(f"{folder}: expected a folder of golden files, found {found}.")
     return sorted(path for name in SUBFOLDERS for path in (folder / name).glob("*.npz"))
 
 
-def _chosen(registry: Sequence[cases.PackChecks], only: tuple[str, ...]) -> list[cases.PackChecks]:
+def _chosen(registry: Sequence[cases.FileChecks], only: tuple[str, ...]) -> list[cases.FileChecks]:
     unknown = [name for name in only if not any(checks.name.startswith(name) for checks in registry)]
     if unknown:
         raise ValueError(f"--only={','.join(unknown)}: expected some of "

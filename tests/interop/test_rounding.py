@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from muvo_jax import config as config_lib
-from muvo_jax.interop.parity import cases, drawing, full_models, golden, runner
+from muvo_jax.interop.parity import cases, drawing, full_models, golden, rounding, runner
 from muvo_jax.model import decoders
 
 TOLERANCE = 1e-4
@@ -80,6 +80,34 @@ def test_an_action_near_zero_of_a_real_decoder(tmp_path):
     for apart, passes in ((0.0, True), (1e-5, False)):
         file = file_of(tmp_path, policy=exact + apart)
         assert outcome(file, drawing.action_check("policy", decoder, features, where, TOLERANCE))[0] == passes
+
+
+def test_a_chamfer_gradient_is_known_as_far_as_expanded_squares_are(tmp_path):
+    """The reference's formula in float32 NumPy: what it makes of near pairs and of ties passes, an error does not."""
+    random = np.random.default_rng(5)
+    targets = random.uniform(-30, 30, (1, 40, 3)).astype(np.float32)
+    targets[0, 1] = targets[0, 0] + np.float32([1.0, 0.0, 0.0])
+    points = (targets + random.normal(0, 0.3, targets.shape)).astype(np.float32)
+    points[0, 0] = (targets[0, 0] + targets[0, 1]) / 2  # equally near to both
+    noise = rounding.chamfer_gradient_noise(points, targets)
+    assert noise.shape == points.shape and noise[0, 0, 0] > 2 / 40 > 10 * np.median(noise)
+
+    def gradient(points, targets, dtype):
+        points, targets = points[0].astype(dtype), targets[0].astype(dtype)
+        squares = (points ** 2).sum(1)[:, None] + (targets ** 2).sum(1)[None] - 2 * points @ targets.T
+        out = np.zeros(points.shape, dtype)
+        for own, other in ((np.arange(40), squares.argmin(1)), (squares.argmin(0), np.arange(40))):
+            distance = np.sqrt(squares[own, other])[:, None]
+            np.add.at(out, own, (points[own] - targets[other]) / distance / 40)
+        return out[None]
+
+    ours, theirs = (gradient(points, targets, dtype) for dtype in (np.float64, np.float32))
+    np.testing.assert_array_less(np.abs(ours - theirs), np.maximum(noise, 1e-8))
+    wrong = theirs.copy()
+    wrong[0, 7, 0] += 0.01 * np.abs(theirs).max()
+    for stored, passes in ((theirs, True), (wrong, False)):
+        check = cases.Check("grad", ours, 1e-5, noise=lambda: noise)
+        assert outcome(file_of(tmp_path, grad=stored), check)[0] == passes
 
 
 def test_the_choice_of_depth_bins_that_the_pack_made_is_kept_for_what_follows(tmp_path):

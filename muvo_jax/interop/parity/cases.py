@@ -26,6 +26,8 @@ class Check:
         too, so one of these may be its value.
       roundings: the same value on weights moved back and forth (rounding.in_pairs), asked for only where `got` misses
         the tolerance and the stored value is near zero; see rounding.error_near_zero.
+      noise: how far each value of the reference itself may be off, an array as `got`, where its formula rounds more
+        than ours; asked for only where `got` misses the tolerance.
       note: what the line of the entry says in the end.
     """
 
@@ -36,6 +38,7 @@ class Check:
     stands_alone: bool = False
     again: Callable[[], Iterator[Any]] | None = None
     roundings: Callable[[], Iterator[Any]] | None = None
+    noise: Callable[[], Any] | None = None
     note: str = ""
 
 

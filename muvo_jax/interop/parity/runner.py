@@ -8,6 +8,8 @@ import math
 import pathlib
 from collections.abc import Callable, Iterable, Sequence
 
+import numpy as np
+
 from muvo_jax.interop.parity import cases, golden, rounding
 
 Print = Callable[[str], None]
@@ -141,6 +143,10 @@ def _error(check: cases.Check, file: golden.File) -> tuple[float, str]:
         error = min(error, check.measure(file, check.entry, value))
         if error <= check.tolerance:
             return error, f"{first:.1e} as first rounded, this in try {tries}"
+    if check.noise:
+        noise = check.noise()
+        return (rounding.error_beyond(file, check.entry, check.got, noise),
+                f"{first:.1e} with the noise of the reference's formula, at most {np.max(noise):.1e}")
     if check.roundings and rounding.is_near_zero(file, check.entry, check.tolerance):
         error, note = rounding.error_near_zero(file, check.entry, check.roundings(), check.tolerance)
         return min(first, error), f"{first:.1e} as first rounded; {note}"

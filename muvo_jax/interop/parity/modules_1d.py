@@ -93,8 +93,8 @@ def decoded(context: cases.Context) -> Checks:
     state = context.draw("state", (count, CONFIG.deterministic_channels + CONFIG.stochastic_channels), "normal")
 
     def plane(entry: str, usual: tuple[int, ...], channels: int) -> decoders.PlaneDecoder:
-        size = (context.shape(f"{entry}_1") or (1, channels, *usual))[2:]
-        return decoders.PlaneDecoder(size, channels, CONFIG.decoder_channels)
+        rows, columns = (context.shape(f"{entry}_1") or usual)[-2:]
+        return decoders.PlaneDecoder((rows, columns), channels, CONFIG.decoder_channels)
 
     yield drawing.action_check("policy/out", decoders.ActionDecoder(), state, "decoders_action/", TOLERANCE)
     voxels = decoders.StyledDecoder(CONFIG.voxels.shape, 2, 2 * CONFIG.occupancy_channels, CONFIG.occupancy_channels,

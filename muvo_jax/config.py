@@ -219,13 +219,6 @@ class ModelConfig:
             if grid.cells < 4 or grid.cells % 4 or not 1 <= grid.lifted_bins <= grid.depth_bins:
                 raise ValueError(f"model.birds_eye: cells {grid.cells} must be a multiple of 4, and lifted_bins "
                                  f"{grid.lifted_bins} lie between 1 and depth_bins {grid.depth_bins}.")
-        if self.backbone == "mobilevitv2_100":
-            view = self.range_view
-            sides = self.image_size + ((view.rows, view.columns) if self.lidar == "rv" and self.latent == "1d" else ())
-            if any(side % 64 for side in sides):
-                raise ValueError(f"model.backbone=mobilevitv2_100 cuts its deepest maps into 2x2 patches: sides "
-                                 f"{list(sides)} of image and range view must be multiples of 64. "
-                                 f"Choose other sizes or model.backbone=resnet18.")
 
 
 @dataclasses.dataclass(frozen=True)

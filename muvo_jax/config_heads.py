@@ -60,12 +60,10 @@ class LossConfig:
     `image` (L1), `image_squared` (L2, an addition to the paper), `range_xyz`, `range_depth` and `occupancy_*` apply per
     scale; 0 switches a term off. The Chamfer term looks at `chamfer_points` returns of each side; a predicted return is
     a predicted range above `return_threshold_m`. Where unknown voxels are ignored, each still counts
-    a predicted range above `return_threshold_m`. Where unknown voxels are ignored, each still counts
     `occupancy_unknown_weight` as an empty one in the cross-entropy: without it a model fills what no ray has reached.
-    Off by default are `image_similarity` (1 - structural similarity; the
-    reference's weight is 0.06 with the 1D latent, 0.03 with the 2D one), `image_perceptual` (0.1 there),
-    `image_instance` (the L1 again, averaged over the pixels of vehicles and pedestrians; 0.05 there, RGB_INSTANCE) and
-    `occupancy_dice`.
+    Off by default are `image_similarity` (1 - structural similarity; the reference's weight is 0.06 with the 1D latent,
+    0.03 with the 2D one), `image_perceptual` (0.1 there), `image_instance` (the L1 again, averaged over the pixels of
+    vehicles and pedestrians; 0.05 there, RGB_INSTANCE) and `occupancy_dice`.
 
     Of the optional heads: `depth` (L1), cross-entropies `semantic_image`, `semantic_range_view` and `birds_eye`, L2 of
     the `birds_eye_centre` map and, at the same weight at every scale, L1 of the `birds_eye_offset` in cells. The

@@ -128,7 +128,7 @@ def _voxels(frame: schema.RawFrame, described: schema.RecordingDescription):
     return voxel_ops.occupancy_target(frame["points_m"], lidar_m, grid), grid
 
 
-def _liveliest(motion: checkup.judgements.Motion) -> int:
+def _liveliest(motion: checkup.judgements.DrivingLog) -> int:
     """The stretch that steers most."""
     numbers = np.unique(motion.stretch)
     return int(max(numbers, key=lambda number: motion.action[motion.stretch == number, 1].std()))

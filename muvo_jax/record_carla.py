@@ -77,7 +77,7 @@ def record(options: Options, show: screen.Screen) -> None:
 
 
 def _drive(options: Options, show: screen.Screen, settings: carla_drives.Settings,
-           jobs: list[carla_drives.Job]) -> None:
+           jobs: list[carla_drives.CarlaDrive]) -> None:
     make_agent = carla_client.load_agent(options.agent) if options.agent else None
     client = carla_client.Client(settings, host=options.host, port=options.port, traffic_port=options.traffic_port,
                                  vehicles=options.vehicles, walkers=options.walkers, make_agent=make_agent)

@@ -18,8 +18,8 @@ WARM_UP_TICKS = 20  # the car settles, sensors start
 _FASTEST_MPS = 30.0
 _WALKING_MPS = 1.4
 
-# make_agent(ego vehicle, route [P, 2]) -> agent(Observed) -> carla.VehicleControl
-Agent = Callable[[carla_frames.Observed], Any]
+# make_agent(ego vehicle, route [P, 2]) -> agent(Tick) -> carla.VehicleControl
+Agent = Callable[[carla_frames.Tick], Any]
 
 
 def import_carla() -> Any:
@@ -88,7 +88,7 @@ class Client:
             raise carla_drives.CarlaError(f"{self._where}: client {versions[0]}, server {versions[1]}; expected "
                                             f"equal versions.")
 
-    def start(self, job: carla_drives.Job) -> carla_frames.Observed:
+    def start(self, job: carla_drives.CarlaDrive) -> carla_frames.Tick:
         with server_errors(f"{self._where}, starting {job.split}/{job.run}"):
             rng = np.random.default_rng(job.seed)
             self._world = self._client.load_world(job.town)
@@ -111,7 +111,7 @@ class Client:
                 self._world.tick(self._timeout_s)
             return self._tick()
 
-    def step(self) -> carla_frames.Observed:
+    def step(self) -> carla_frames.Tick:
         with server_errors(f"{self._where}, driving"):
             if self._agent is not None:
                 self._ego.apply_control(self._agent(self._observed))
@@ -135,10 +135,10 @@ class Client:
             self._client.get_trafficmanager(self._traffic_port).set_synchronous_mode(False)
         self._actors, self._controllers = [], []
 
-    def _tick(self) -> carla_frames.Observed:
+    def _tick(self) -> carla_frames.Tick:
         frame = self._world.tick(self._timeout_s)
         measurements = carla_frames.collect(self._queues, frame, self._timeout_s)
-        self._observed = carla_frames.Observed(
+        self._observed = carla_frames.Tick(
             frame, self._world.get_snapshot().timestamp.elapsed_seconds, self._ego.get_transform(),
             self._ego.get_velocity(), self._ego.get_control(), measurements, collided=drained(self._collisions))
         return self._observed

@@ -55,7 +55,7 @@ class Settings:
         return self.width_px * self.height_px * (3 + 2 + 1) + self.points_per_frame * 13 + 64 * 64
 
 
-class Job(NamedTuple):
+class CarlaDrive(NamedTuple):
     """One run to record."""
 
     split: str
@@ -67,7 +67,7 @@ class Job(NamedTuple):
 
 
 def plan(*, towns: Sequence[str] = TOWNS, train_runs: int = 25, val_runs: int = 5, run_s: float = RUN_S,
-         rate_hz: float = carla.RATE_HZ, seed: int = 0) -> list[Job]:
+         rate_hz: float = carla.RATE_HZ, seed: int = 0) -> list[CarlaDrive]:
     """The paper's runs: train, val_rl (same weathers) and val_ds (others), weathers drawn at random."""
     jobs = []
     runs_of, weathers_of = (train_runs, val_runs, val_runs), (WEATHERS, WEATHERS, SHIFTED_WEATHERS)
@@ -75,7 +75,7 @@ def plan(*, towns: Sequence[str] = TOWNS, train_runs: int = 25, val_runs: int = 
         for town in towns:
             for index in range(runs):
                 rng = np.random.default_rng([seed, number, index, *town.encode()])
-                jobs.append(Job(split, f"{town}_{index:03d}", town, str(rng.choice(weathers)),
+                jobs.append(CarlaDrive(split, f"{town}_{index:03d}", town, str(rng.choice(weathers)),
                                 int(rng.integers(1 << 30)), round(run_s * rate_hz)))
     return jobs
 
@@ -97,7 +97,7 @@ class Estimate(NamedTuple):
                 f"{self.hours:.1f} hours ({how}).")
 
 
-def estimate(out: pathlib.Path, jobs: Sequence[Job], settings: Settings) -> Estimate:
+def estimate(out: pathlib.Path, jobs: Sequence[CarlaDrive], settings: Settings) -> Estimate:
     """See Estimate."""
     complete = [job for job in jobs if recorder.is_complete(out, job.split, job.run)]
     frames = sum(job.frames for job in jobs)

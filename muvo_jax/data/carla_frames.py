@@ -26,7 +26,7 @@ _ROUTE_AHEAD = 40  # points drawn, and searched for the nearest
 ROUTE_SPACING_M = 2.0
 
 
-class Observed(NamedTuple):
+class Tick(NamedTuple):
     """One tick. transform, velocity and control are the client's; `control` led from the tick before to this one, and
     `collided` tells whether the car hit something on the way.
     """
@@ -62,7 +62,7 @@ def collect(queues: Mapping[str, queue.Queue], frame: int, timeout_s: float) -> 
     return found
 
 
-def decode(seen: Observed, settings: Settings) -> dict[str, np.ndarray]:
+def decode(seen: Tick, settings: Settings) -> dict[str, np.ndarray]:
     """The measurements of a tick as recorder.RunWriter.write takes them."""
     pixels = {name: bgra(seen.measurements[name], name, settings) for name in CAMERAS}
     detections = np.frombuffer(seen.measurements["lidar"].raw_data, _DETECTION)

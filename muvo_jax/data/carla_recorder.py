@@ -16,8 +16,8 @@ from typing import Protocol
 import numpy as np
 
 from muvo_jax.data import carla, carla_frames, processes, recorder, schema
-from muvo_jax.data.carla_drives import SPLITS, BadDriveError, CarlaError, Job, Settings, estimate
-from muvo_jax.data.carla_frames import SENSORS, Observed
+from muvo_jax.data.carla_drives import SPLITS, BadDriveError, CarlaDrive, CarlaError, Settings, estimate
+from muvo_jax.data.carla_frames import SENSORS, Tick
 
 ATTEMPTS = 3
 MOVING_MPS = 1.0
@@ -30,11 +30,11 @@ _IN_LANE_M = 2.0
 class Simulator(Protocol):
     """All that the recorder asks of CARLA."""
 
-    def start(self, job: Job) -> Observed:
+    def start(self, job: CarlaDrive) -> Tick:
         """Loads town and weather, places traffic, car and sensors, and returns the first tick to record."""
         ...
 
-    def step(self) -> Observed:
+    def step(self) -> Tick:
         """One tick on."""
         ...
 
@@ -47,7 +47,7 @@ class Simulator(Protocol):
         ...
 
 
-def record(out: pathlib.Path, simulator: Simulator, jobs: Sequence[Job], settings: Settings, *,
+def record(out: pathlib.Path, simulator: Simulator, jobs: Sequence[CarlaDrive], settings: Settings, *,
            progress: Callable[[int, int], None] | None = None) -> None:
     """Records every run that is not complete.
 
@@ -62,7 +62,7 @@ def record(out: pathlib.Path, simulator: Simulator, jobs: Sequence[Job], setting
         _record_missing(out, simulator, jobs, settings, progress)
 
 
-def _record_missing(out: pathlib.Path, simulator: Simulator, jobs: Sequence[Job], settings: Settings,
+def _record_missing(out: pathlib.Path, simulator: Simulator, jobs: Sequence[CarlaDrive], settings: Settings,
                     progress: Callable[[int, int], None] | None) -> None:
     for job in jobs:
         if recorder.is_complete(out, job.split, job.run):
@@ -83,7 +83,7 @@ def _record_missing(out: pathlib.Path, simulator: Simulator, jobs: Sequence[Job]
                     raise
 
 
-def record_run(out: pathlib.Path, simulator: Simulator, job: Job, settings: Settings) -> Iterator[int]:
+def record_run(out: pathlib.Path, simulator: Simulator, job: CarlaDrive, settings: Settings) -> Iterator[int]:
     """Records one run, yielding the number of frames so far; frames.csv is written once all files are there."""
     writer = recorder.RunWriter(out, job.split, job.run)
     try:
@@ -123,13 +123,13 @@ def reward(collided: bool, aside_m: float, turned_rad: float) -> float:
 class Health:
     """Checks each frame of a run before it is written."""
 
-    def __init__(self, job: Job, rate_hz: float):
+    def __init__(self, job: CarlaDrive, rate_hz: float):
         self._job, self._rate_hz = job, rate_hz
         self._same = dict.fromkeys(SENSORS, 0)
         self._checksums: dict[str, int] = {}
         self._still = 0
 
-    def check(self, index: int, seen: Observed, following: Observed, frame: Mapping[str, np.ndarray],
+    def check(self, index: int, seen: Tick, following: Tick, frame: Mapping[str, np.ndarray],
               speed_mps: float, off_route_m: float) -> None:
         """Raises CarlaError for blank or frozen sensors and lost ticks, BadDriveError for a bad drive."""
         where = f"{self._job.split}/{self._job.run}, frame {index}"

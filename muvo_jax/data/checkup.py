@@ -32,7 +32,7 @@ class Checkup:
 
     facts: dict[str, str]
     findings: tuple[judgements.Finding, ...]
-    motion: judgements.Motion
+    motion: judgements.DrivingLog
     pictures: tuple[Sample, ...]
     alignment: alignment_lib.Alignment | None
 
@@ -131,10 +131,10 @@ def refused(recording: str, error: schema.DataError) -> Checkup:
     return Checkup({"recording": recording, "read": "nothing"}, (finding,), _motion([]), (), None)
 
 
-def _motion(scalars: list[tuple]) -> judgements.Motion:
+def _motion(scalars: list[tuple]) -> judgements.DrivingLog:
     """From (stretch, acceleration, steering, speed, yaw rate, time stamp) of every frame."""
     table = np.array(scalars, np.float64).reshape(-1, 6)
-    return judgements.Motion(table[:, 0].astype(int), table[:, 1:3], table[:, 3], table[:, 4], table[:, 5])
+    return judgements.DrivingLog(table[:, 0].astype(int), table[:, 1:3], table[:, 3], table[:, 4], table[:, 5])
 
 
 def _metres(values: Iterable[float]) -> str:

@@ -28,7 +28,7 @@ class Finding(NamedTuple):
 
 
 @dataclasses.dataclass(frozen=True)
-class Motion:
+class DrivingLog:
     """Actions beside what was measured, of all stretches one after the other.
 
     Attributes:
@@ -67,7 +67,7 @@ def of_splits(recording: schema.Recording) -> list[Finding]:
     return found
 
 
-def of_actions(motion: Motion, contract: config_lib.ActionContract) -> list[Finding]:
+def of_actions(motion: DrivingLog, contract: config_lib.ActionContract) -> list[Finding]:
     found = []
     action = motion.action
     if not len(action):
@@ -125,7 +125,7 @@ def _gain(acceleration: np.ndarray, measured_mps2: np.ndarray, contract: config_
                                f"accel_full_mps2 and brake_full_mps2, or say kinematics = \"none\".")]
 
 
-def of_time(motion: Motion, rate_hz: float) -> list[Finding]:
+def of_time(motion: DrivingLog, rate_hz: float) -> list[Finding]:
     steps_s = np.diff(motion.timestamp_s)[np.diff(motion.stretch) == 0]
     if not len(steps_s):
         return []

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 from flax import linen
 
 from muvo_jax.nn import layers, norm
+from muvo_jax.ops import resample
 
 _EXPANSION = 2
 _PATCH = 2
@@ -87,14 +88,19 @@ class LinearTransformerLayer(linen.Module):
 
 
 class MobileVitBlock(linen.Module):
-    """[N, H, W, C] -> the same: depthwise 3x3, linear attention at half width among equal places of 2x2 patches."""
+    """Depthwise 3x3, linear attention at half width among equal places of 2x2 patches: [N, H, W, C] -> [N, H', W', C].
+
+    An odd side grows by one, linearly and before all else, so that patches are whole: H' and W' are even.
+    """
 
     blocks: int
     compute: layers.Compute = layers.Compute()
 
     @linen.compact
     def __call__(self, x: jax.Array, mode: norm.Mode) -> jax.Array:
-        frames, rows, columns, channels = x.shape
+        frames, *size, channels = x.shape
+        rows, columns = (side + side % _PATCH for side in size)
+        x = resample.resize_corners(x, (rows, columns))
         x = ConvNorm(channels, 3, self.compute, depthwise=True, name="local")(x, mode)
         x = layers.Dense(channels // 2, self.compute, use_bias=False, name="enter")(x)
         x = x.reshape(frames, rows // _PATCH, _PATCH, columns // _PATCH, _PATCH, channels // 2)
@@ -110,16 +116,21 @@ class MobileVitBlock(linen.Module):
 class MobileVit(linen.Module):
     """Feature maps of chosen levels: [N, H, W, I] -> level l: [N, H / 2**(l+1), W / 2**(l+1), C of the level].
 
-    The levels have 2, 4, 6 and 8 times `width` channels. A level with attention needs even rows and columns. Levels
-    above the last one asked for have no parameters.
+    The levels have 2, 4, 6 and 8 times `width` channels. Levels above the last one asked for have no parameters. A
+    level with attention works on even sides; a map that grew for that is resized to its own size in the end.
+
+    Attributes:
+      keep_grown: such a map stays as it is, as in timm; without, necks and fusion can count on the sizes above.
     """
 
     width: int
     levels: tuple[int, ...]
     compute: layers.Compute = layers.Compute()
+    keep_grown: bool = False
 
     @linen.compact
     def __call__(self, x: jax.Array, mode: norm.Mode) -> list[jax.Array]:
+        sides = x.shape[1:3]
         x = ConvNorm(self.width // 2, 3, self.compute, stride=2, name="stem")(x, mode)
         x = Bottleneck(self.width, 1, self.compute, name="stage0_0")(x, mode)
         maps = []
@@ -131,5 +142,6 @@ class MobileVit(linen.Module):
             else:
                 x = Bottleneck(factor * self.width, 1, self.compute, name=f"stage{level}_1")(x, mode)
             if level in self.levels:
-                maps.append(x)
+                rows, columns = (-(-side // 2 ** (level + 1)) for side in sides)
+                maps.append(x if self.keep_grown else resample.resize_corners(x, (rows, columns)))
         return maps

@@ -1,7 +1,8 @@
-"""Changing the resolution of grids: linear up-sampling, the mean of 2x2 pixels, pooled voxels.
+"""Changing the resolution of grids: linear sampling, the mean of 2x2 pixels, pooled voxels.
 
-Linear sampling is that of torch with align_corners=False and no antialiasing: output pixel i reads input position
-(i + 1/2) * (input size / output size) - 1/2, clamped to the grid.
+upsample_linear is torch's interpolation with align_corners=False and no antialiasing: output pixel i reads input
+position (i + 1/2) * (input size / output size) - 1/2, clamped to the grid. resize_corners is that with
+align_corners=True: corners stay where they are, pixel i reads i * (input size - 1) / (output size - 1).
 """
 
 from __future__ import annotations
@@ -82,6 +83,30 @@ def pool_occupancy(occupancy):
     unknown = (blocks == OCCUPANCY_UNKNOWN).all(axis=within)
     dtype = occupancy.dtype
     return occupied.astype(dtype) * OCCUPANCY_OCCUPIED + (unknown & ~occupied).astype(dtype) * OCCUPANCY_UNKNOWN
+
+
+def resize_corners(x, size: tuple[int, int]):
+    """Resizes rows and columns linearly between fixed corners (torch: bilinear, align_corners=True).
+
+    An axis of one pixel, before or after, has no two corners: one pixel is repeated, and the middle becomes one pixel
+    (torch takes the first).
+
+    Args:
+      x: float [N, H, W, C].
+      size: rows and columns of the result.
+
+    Returns:
+      [N, *size, C] of the dtype of x.
+    """
+    if x.shape[1:3] == tuple(size):
+        return x
+    cornered = [min(old, new) > 1 for old, new in zip(x.shape[1:3], size, strict=True)]
+    scale = jnp.array([(new - 1) / (old - 1) if corners else new / old
+                       for old, new, corners in zip(x.shape[1:3], size, cornered, strict=True)])
+    # The library's rule is that of pixel centres: the shift brings the corners' centres together.
+    shift = jnp.where(jnp.array(cornered), (1 - scale) / 2, 0.0)
+    return jax.image.scale_and_translate(x, (x.shape[0], *size, x.shape[-1]), (1, 2), scale, shift, "linear",
+                                         antialias=False)
 
 
 def mean_pool2(x):

@@ -24,7 +24,7 @@ from muvo_jax.data import (
 )
 
 SETTINGS = carla_drives.Settings(width_px=24, height_px=16, points_per_frame=50)
-JOB = carla_drives.Job("train", "Town01_000", "Town01", "ClearNoon", 3, 14)
+JOB = carla_drives.CarlaDrive("train", "Town01_000", "Town01", "ClearNoon", 3, 14)
 needs_carla = pytest.mark.skipif(importlib.util.find_spec("carla") is None, reason="carla is not installed")
 DETECTION = np.dtype("<f4, <f4, <f4, <f4, <u4, <u4")  # x, y, z, cosine, object, tag: 24 bytes
 
@@ -73,7 +73,7 @@ class FakeSimulator:
                     for name in carla_frames.CAMERAS}
         rows = [(10 + index, 4, -2, 0.5, 7, 24), (0, 0, -1, 0.5, 1, 14), (20, -3, 1, 0.5, 9, 14)]
         control = types.SimpleNamespace(throttle=0.0 if index % 2 else 0.5, steer=0.01 * index, brake=0.25)
-        return self.spoil(carla_frames.Observed(
+        return self.spoil(carla_frames.Tick(
             self.tick, self.tick * 0.1, transform(0.0, 0.1 * self.speed_mps * index, 90.0), vector(y=self.speed_mps),
             control, {**pictures, "lidar": scan(self.tick, rows)}))
 

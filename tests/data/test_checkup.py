@@ -23,7 +23,7 @@ def drive(**changes):
     yaw_rate_radps = -speed_mps * np.tan(CONTRACT.steer_full_rad * action[:, 1]) / CONTRACT.wheelbase_m
     fields = {"stretch": np.arange(100) // 50, "action": action, "speed_mps": speed_mps,
               "yaw_rate_radps": yaw_rate_radps, "timestamp_s": np.arange(100) / 10} | changes
-    return judgements.Motion(**fields)
+    return judgements.DrivingLog(**fields)
 
 
 def problems(motion, contract=CONTRACT):

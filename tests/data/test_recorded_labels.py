@@ -23,7 +23,7 @@ def recording(tmp_path_factory):
     folder = tmp_path_factory.mktemp("town")
     town_config = settings.from_config(CONFIG)
     record.describe(folder, town_config, ("train",))
-    for _ in record.record_run(folder, Town(town_config), record.Job("train", "000_day", 7, "clear_noon", 8)):
+    for _ in record.record_run(folder, Town(town_config), record.TownDrive("train", "000_day", 7, "clear_noon", 8)):
         pass
     return plain.PlainRecording(folder, labels=prepare.labels(CONFIG))
 

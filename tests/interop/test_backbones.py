@@ -9,7 +9,8 @@ import pytest
 import torch_writer
 
 from muvo_jax import presets, train
-from muvo_jax.interop import backbones, packs, safetensors_file, weights_rule
+from muvo_jax.interop import backbones, safetensors_file, weights_rule
+from muvo_jax.interop.parity import golden
 from muvo_jax.model import world_model
 from muvo_jax.training import optimizer, preparation, state
 from muvo_jax.training import step as step_lib
@@ -21,7 +22,7 @@ WIDE = dataclasses.replace(TINY, backbone_width=64, heads=("image", "action"))
 def image_network(manifest):
     """timm's name -> array, of the image encoder in a manifest of the reference, whose last layers are as in timm."""
     return {key.removeprefix("encoder."): weights_rule.make_param(key, shape)
-            for key, shape in packs.manifest(manifest).items() if key.startswith("encoder.")}
+            for key, shape in golden.manifest(manifest).items() if key.startswith("encoder.")}
 
 
 @pytest.fixture(scope="module")

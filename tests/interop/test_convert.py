@@ -13,7 +13,8 @@ import torch_writer
 import muvo_jax
 from muvo_jax import config as config_lib
 from muvo_jax import convert, dream, evaluate, presets, train
-from muvo_jax.interop import checkpoints, export_torch, names, packs, safetensors_file, weights_rule
+from muvo_jax.interop import checkpoints, export_torch, names, safetensors_file, weights_rule
+from muvo_jax.interop.parity import golden
 from muvo_jax.model import world_model
 from muvo_jax.training import checkpoint, screen
 
@@ -151,7 +152,7 @@ def test_a_converted_run_is_judged_dreams_and_trains_on(tmp_path, monkeypatch):
 @pytest.mark.slow
 def test_a_checkpoint_of_full_size(tmp_path):
     """About 700 MB in the released 1D model's shapes, converted and loaded; prints seconds and peak memory."""
-    manifest = packs.manifest("1d_RV_WOB_TR_voxel")
+    manifest = golden.manifest("1d_RV_WOB_TR_voxel")
     state_dict = {f"model.{key}": weights_rule.make_param(key, shape) for key, shape in manifest.items()}
     torch_writer.write_zip(tmp_path / "full.ckpt", {"state_dict": torch_writer.tensors(state_dict)})
     assert (tmp_path / "full.ckpt").stat().st_size > 700e6

@@ -1,4 +1,4 @@
-"""The reader of the MUVO layout against what the authors' dataset class reads (skipped where there is no pack)."""
+"""The reader of the MUVO layout against what the authors' dataset class reads (skipped where there is no file)."""
 
 import json
 import pathlib
@@ -15,12 +15,12 @@ import recording_samples as samples
 
 pytestmark = pytest.mark.skipif(
     samples.MUVO_LAYOUT is None or samples.GOLDEN is None or not (samples.GOLDEN / p6.POINTERS_FILE).is_file(),
-    reason="no pack P6 with its recordings here; name them by MUVO_GOLDEN and MUVO_LAYOUT")
+    reason="no file P6 with its recordings here; name them by MUVO_GOLDEN and MUVO_LAYOUT")
 ARRAYS = "p6_dataset.npz"
 
 
 def test_pointers_filters_and_batches_agree():
-    report = runner.run_folder(samples.GOLDEN, registry.PACKS, only=["p6"], recordings=samples.MUVO_LAYOUT,
+    report = runner.run_folder(samples.GOLDEN, registry.FILES, only=["p6"], recordings=samples.MUVO_LAYOUT,
                                write=lambda _: None)
     assert report.ok and report.passed > 100
 
@@ -40,7 +40,7 @@ def test_what_differs_is_found(tmp_path):
     changed["b0/steering"] = changed["b0/steering"] + np.float32(1e-3)
     np.savez(tmp_path / ARRAYS, **changed)
     lines = []
-    report = runner.run_folder(tmp_path, registry.PACKS, only=["p6"], recordings=samples.MUVO_LAYOUT,
+    report = runner.run_folder(tmp_path, registry.FILES, only=["p6"], recordings=samples.MUVO_LAYOUT,
                                write=lines.append)
     bad = [line for line in lines if "FAIL" in line]
     assert report.failed == len(bad) == 3
@@ -49,8 +49,8 @@ def test_what_differs_is_found(tmp_path):
 
 
 def test_recordings_of_another_drive_fail(tmp_path):
-    """A pack is not satisfied by just any recording."""
+    """A file is not satisfied by just any recording."""
     run = "trainval/val0/Town03/0000"
     shutil.copytree(samples.MUVO_LAYOUT / run, tmp_path / run)
-    report = runner.run_folder(samples.GOLDEN, registry.PACKS, only=["p6"], recordings=tmp_path, write=lambda _: None)
+    report = runner.run_folder(samples.GOLDEN, registry.FILES, only=["p6"], recordings=tmp_path, write=lambda _: None)
     assert not report.ok and any("no run Town01/0000 in train" in line for line in report.unexplained)

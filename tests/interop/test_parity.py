@@ -1,19 +1,24 @@
-"""The parity check: its rule, its reader, what it accepts and refuses, and the packs that lie in tests/golden."""
+"""The parity check: its rule, its reader, what it accepts and refuses, and the files that lie in tests/golden."""
 
 import dataclasses
 import json
+import pathlib
+import re
+import subprocess
+import sys
 import zlib
 
 import golden_rule
 import numpy as np
 import pytest
 
-from muvo_jax.interop import packs, reference_data, weights_rule
-from muvo_jax.interop.parity import cases, geometry, losses, modules_1d, modules_2d, pooling, registry, runner
+import muvo_jax
+from muvo_jax.interop import reference_data, weights_rule
+from muvo_jax.interop.parity import cases, geometry, golden, losses, modules_1d, modules_2d, pooling, registry, runner
 
 SILENT = lambda line: None
-# Only the losses that the made-up packs hold: the others would be computed for nothing.
-SMALL = (dataclasses.replace(registry.PACKS[0], groups=(losses.divergence, losses.regressions, losses.spatial)),)
+# Only the losses that the made-up files hold: the others would be computed for nothing.
+SMALL = (dataclasses.replace(registry.FILES[0], groups=(losses.divergence, losses.regressions, losses.spatial)),)
 # CRC-32 of arrays that the rule must give on every machine.
 WEIGHTS = {("rssm.prior.module.0.weight", (64, 64)): 107853824, ("a.bn1.weight", (16,)): 2935760857,
            ("a.bn1.bias", (16,)): 3539044924, ("a.bn1.running_var", (16,)): 2782270229,
@@ -27,6 +32,17 @@ INPUTS = {("normal", (5, 7)): 2250587215, ("smooth", (2, 20, 30)): 1229600280, (
 
 def checksum(array):
     return zlib.crc32(np.ascontiguousarray(array).tobytes())
+
+
+def test_nothing_loads_the_harness_but_its_own_command():
+    package = pathlib.Path(muvo_jax.__file__).parent
+    for path in sorted(set(package.rglob("*.py")) - set((package / "interop" / "parity").rglob("*.py"))):
+        imports = [line for line in path.read_text().splitlines() if re.match(r"\s*(from|import) ", line)]
+        assert not [line for line in imports if re.search(r"interop\.parity|interop import .*\bparity\b", line)], path
+    program = ("import sys, muvo_jax, muvo_jax.convert, muvo_jax.interop.export_torch; muvo_jax.imagine; "
+               "print([name for name in sys.modules if name.startswith('muvo_jax.interop.parity')])")
+    printed = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True).stdout
+    assert printed.strip() == "[]"
 
 
 def test_the_rule_draws_the_same_numbers_everywhere():
@@ -46,19 +62,19 @@ def test_error_of_a_subsampled_entry_sees_what_was_not_stored(tmp_path):
     np.savez(tmp_path / "p.npz", **{
         "whole": values, "part::sub": values.reshape(-1)[::5], "part::meta": np.array([5, 3, 4]),
         "part::stats": np.array([values.mean(), values.std(), 0, 11, np.sqrt((values ** 2).sum())])})
-    pack = packs.Pack(tmp_path / "p.npz")
-    assert pack.names == ["part", "whole"] and pack.shape("part") == (3, 4)
-    assert pack.error("whole", values + 1.1) == pytest.approx(0.1)
-    assert pack.error("part", values) < 1e-6
+    file = golden.File(tmp_path / "p.npz")
+    assert file.names == ["part", "whole"] and file.shape("part") == (3, 4)
+    assert file.error("whole", values + 1.1) == pytest.approx(0.1)
+    assert file.error("part", values) < 1e-6
     unseen = values.copy()
     unseen[2, 3] = 0.0  # flat index 11, which the stride of 5 skips
-    assert pack.error("part", unseen) > 0.05
+    assert file.error("part", unseen) > 0.05
     with pytest.raises(ValueError, match=r"got shape \[4, 3\], expected \[3, 4\]"):
-        pack.error("whole", values.T)
+        file.error("whole", values.T)
 
 
 def write_folder(folder, entries, **settings):
-    """A folder of packs as the command takes it."""
+    """A folder of files as the command takes it."""
     (folder / "pack.json").write_text(json.dumps({"format": 1, **settings}))
     np.savez(folder / "p1_losses_metrics.npz", **entries)
     return folder
@@ -84,7 +100,7 @@ def other_pack():
             "kl0.75_1d/loss": divergence.sum(-1).mean()}
 
 
-def test_packs_of_another_seed_and_other_sizes(tmp_path):
+def test_kinds_another_seed_and_other_sizes(tmp_path):
     sizes = {"p1": {"regression": [3, 4, 1], "spatial_hw": [10, 14], "kl_1d": [1, 5, 6]}}
     entries = other_pack()
     report = runner.run_folder(write_folder(tmp_path, entries, seed=5, **sizes), SMALL, only=["p1"],
@@ -101,35 +117,60 @@ def test_a_wrong_number_and_an_unknown_entry_fail(tmp_path):
     assert any("hyperbolic/loss" in line for line in report.lines())
 
 
+def test_what_stops_fails_and_hides_nothing_else(tmp_path):
+    """A group that raises, a measure that raises, a file that is cut off: each fails, the others are checked."""
+    def stops(context):
+        yield cases.Check("early", np.float32(1.0), 1e-6)
+        raise MemoryError("no room for late")
+
+    def unmeasurable(file, entry, got):
+        raise IndexError("no such pixel")
+
+    groups = (stops, lambda context: (cases.Check("odd", np.float32(1.0), 1e-6, unmeasurable),
+                                      cases.Check("last", np.float32(1.0), 1e-6)))
+    entries = {name: np.float32(1.0) for name in ("early", "late", "odd", "last", "told")}
+    np.savez(write_folder(tmp_path, entries) / "broken.npz", x=np.zeros(9))
+    (tmp_path / "broken.npz").write_bytes((tmp_path / "broken.npz").read_bytes()[:90])
+    kinds = [cases.FileChecks("broken", (r"broken\.npz",), groups),
+                cases.FileChecks("p1", (r"p1_.*",), groups, {"told": "for information only"})]
+    lines = []
+    report = runner.run_folder(tmp_path, kinds, write=lines.append)
+    assert (report.passed, report.failed, report.left_out.total(), report.unexplained) == (2, 3, 1, [])
+    assert not report.ok
+    failed = {line.split()[1]: line for line in lines if "FAIL" in line}
+    assert "stops stopped with MemoryError: no room for late" in failed["late"]
+    assert "IndexError: no such pixel" in failed["odd"] and any("broken.npz: expected an npz file" in line
+                                                                for line in report.lines())
+
+
 def test_what_cannot_be_checked_is_said(tmp_path):
-    with pytest.raises(packs.PackError, match="found none"):
-        runner.run_folder(tmp_path, registry.PACKS, write=SILENT)
+    with pytest.raises(golden.GoldenError, match="found none"):
+        runner.run_folder(tmp_path, registry.FILES, write=SILENT)
     np.savez(tmp_path / "p1_losses_metrics.npz", x=np.zeros(2))
-    with pytest.raises(packs.PackError, match=r"pack\.json: expected the JSON description"):
-        runner.run_folder(tmp_path, registry.PACKS, write=SILENT)
+    with pytest.raises(golden.GoldenError, match=r"pack\.json: expected the JSON description"):
+        runner.run_folder(tmp_path, registry.FILES, write=SILENT)
     write_folder(tmp_path, {"x": np.array([object()])}, seed=0)
-    with pytest.raises(packs.PackError, match=r"p1_losses_metrics\.npz: expected an npz file of plain arrays"):
-        runner.run_folder(tmp_path, registry.PACKS, write=SILENT)
+    objects = runner.run_folder(tmp_path, registry.FILES, write=SILENT)
+    assert "p1_losses_metrics.npz: expected an npz file of plain arrays" in objects.stopped[0] and objects.failed == 1
     (tmp_path / "pack.json").write_text(json.dumps({"format": 9}))
-    with pytest.raises(packs.PackError, match="expected format 1, found 9"):
-        runner.run_folder(tmp_path, registry.PACKS, write=SILENT)
+    with pytest.raises(golden.GoldenError, match="expected format 1, found 9"):
+        runner.run_folder(tmp_path, registry.FILES, write=SILENT)
     with pytest.raises(ValueError, match="--only=q1"):
-        runner.run_folder(tmp_path, registry.PACKS, only=["q1"], write=SILENT)
+        runner.run_folder(tmp_path, registry.FILES, only=["q1"], write=SILENT)
 
 
 def test_recordings_are_asked_for(tmp_path):
     np.savez(tmp_path / "p6_dataset.npz", x=np.zeros(2))
-    report = runner.run_folder(tmp_path, registry.PACKS, write=SILENT)  # needs no pack.json
+    report = runner.run_folder(tmp_path, registry.FILES, write=SILENT)  # needs no pack.json
     assert not report.unexplained and runner.RECORDINGS_REASON in next(iter(report.left_out))
 
 
 def checked(name, file, groups):
-    """The report of some groups of a pack in tests/golden; what other groups check counts as unexplained."""
-    checks = next(checks for checks in registry.PACKS if checks.name == name)
+    """The report of some groups of a file in tests/golden; what other groups check counts as unexplained."""
+    checks = next(checks for checks in registry.FILES if checks.name == name)
     report, lines = runner.Report(), []
-    pack = packs.Pack(golden_rule.FOLDER / file)
-    context = cases.Context(pack, packs.Settings(golden_rule.FOLDER))
-    runner.run_pack(dataclasses.replace(checks, groups=groups), context, report, lines.append)
+    context = cases.Context(golden.File(golden_rule.FOLDER / file), golden.Settings(golden_rule.FOLDER))
+    runner.run_file(dataclasses.replace(checks, groups=groups), context, report, lines.append)
     assert not report.failed, "\n".join(lines)
     return report
 
@@ -172,8 +213,8 @@ def test_a_kink_is_compared_on_both_of_its_sides(tmp_path):
     sides = lambda: iter([np.float32(0.0), np.float32(1.0)])
     group = lambda context: (cases.Check(entry, np.float32(0.0), 1e-3, again=sides) for entry in ("slope", "level"))
     report, lines = runner.Report(), []
-    runner.run_pack(cases.PackChecks("p", ("p",), (group,)),
-                    cases.Context(packs.Pack(tmp_path / "p.npz"), packs.Settings()), report, lines.append)
+    runner.run_file(cases.FileChecks("p", ("p",), (group,)),
+                    cases.Context(golden.File(tmp_path / "p.npz"), golden.Settings()), report, lines.append)
     assert (report.passed, report.failed) == (1, 1)
     assert "1.0e+00 as first rounded, this in try 2" in lines[0] and "FAIL" in lines[1]
 
@@ -183,5 +224,5 @@ def test_a_kink_is_compared_on_both_of_its_sides(tmp_path):
     ("p1", "p1_losses_metrics.npz", 142), ("p3_1d", "p3_modules_1d.npz", 61), ("p3_2d", "p3_modules_2d.npz", 82),
     ("p5_losses", "p5_losses_all_1d.npz", 42), ("p5_losses", "p5_losses_all_2d.npz", 39)])
 def test_whole_packs(name, file, entries):
-    checks = next(checks for checks in registry.PACKS if checks.name == name)
+    checks = next(checks for checks in registry.FILES if checks.name == name)
     assert checked(name, file, checks.groups).passed == entries

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from muvo_jax import config as config_lib
-from muvo_jax.interop import checkpoints, names, packs
+from muvo_jax.interop import checkpoints, names
+from muvo_jax.interop.parity import golden
 
 LIDAR_ONLY = ("range_view", "action")
 VARIANTS = {
@@ -39,13 +40,13 @@ def reference_config(name):
 @pytest.mark.parametrize("name", VARIANTS)
 def test_parameters_match_one_to_one(name):
     unused = "num_batches_tracked|encoder_layer|transformer_decoder_layer|bev_intrinsics"
-    theirs = {key: shape for key, shape in packs.manifest(name).items() if not re.search(unused, key)}
+    theirs = {key: shape for key, shape in golden.manifest(name).items() if not re.search(unused, key)}
     assert names.reference_shapes(reference_config(name)) == theirs
 
 
 def stored(name, **filled):
     """A checkpoint of the variant's keys and shapes, zeros but for what is given."""
-    zeros = {key: np.broadcast_to(np.float32(0), shape) for key, shape in packs.manifest(name).items()}
+    zeros = {key: np.broadcast_to(np.float32(0), shape) for key, shape in golden.manifest(name).items()}
     return checkpoints.Stored(pathlib.Path(name), zeros | filled, {}, {})
 
 

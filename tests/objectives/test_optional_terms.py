@@ -1,4 +1,4 @@
-"""Terms of the optional heads on maps that can be worked out by hand; the parity packs have the reference's numbers."""
+"""Terms of the optional heads on maps that can be worked out by hand; the parity files have the reference's numbers."""
 
 import dataclasses
 
@@ -10,7 +10,8 @@ import pytest
 
 from muvo_jax import config as config_lib
 from muvo_jax import types
-from muvo_jax.interop import packs, reference_preprocess
+from muvo_jax.interop import reference_preprocess
+from muvo_jax.interop.parity import golden
 from muvo_jax.nn import resnet
 from muvo_jax.objectives import classification, instances, perceptual, similarity, terms, total
 
@@ -98,7 +99,7 @@ def test_depth_is_learned_in_units_of_the_range_where_nothing_is_too():
 
 def test_image_terms_with_road_users_once_more_are_the_references():
     """Golden entries rgb_1, rgb_2, rgb_4 (RGB_INSTANCE): 0.1/f * (L1 + 0.5 * L1 where vehicles and pedestrians are)."""
-    golden, draw = golden_rule.Golden("p5_losses_all_1d.npz"), packs.Settings(golden_rule.FOLDER).draw
+    stored, draw = golden_rule.Golden("p5_losses_all_1d.npz"), golden.Settings(golden_rule.FOLDER).draw
     image = reference_preprocess.crop(draw("full_image", (1, 2, 3, 600, 960), "image_u8"))
     mask = reference_preprocess.crop(draw("pre_imask", (1, 2, 1, 600, 960), "mask"))[:, :, 0]
     predictions = {f: np.moveaxis(draw(f"o_rgb_{f}", (1, 2, 3, 320 // f, 832 // f), "smooth"), 2, -1)
@@ -114,7 +115,7 @@ def test_image_terms_with_road_users_once_more_are_the_references():
     got, expected = jax.jit(every)(batch), 0.0
     for f in (1, 2, 4):
         rgb = (0.1 * got[f"image_{f}"] + 0.05 * got[f"image_instance_{f}"]) / f
-        assert golden.error(f"loss/rgb_{f}", rgb) < 1e-5
+        assert stored.error(f"loss/rgb_{f}", rgb) < 1e-5
         expected += rgb
     np.testing.assert_allclose(got["total"], expected, rtol=1e-6)
     with pytest.raises(ValueError, match=r"loss\.image_instance is on, but the batch has no image_instance_mask"):

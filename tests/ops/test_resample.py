@@ -43,6 +43,25 @@ def test_upsampling_gradient_is_the_transpose_of_the_map(strict_dtypes):
     np.testing.assert_allclose(backward, forward.T, atol=1e-6)
 
 
+def test_resizing_between_corners_reads_equal_steps_from_the_first_to_the_last_pixel(strict_dtypes):
+    line = jnp.array([0.0, 1.0, 4.0, 9.0, 16.0])[None, :, None, None]
+    longer = resample.resize_corners(line, (6, 1))  # reads 0, 0.8, 1.6, 2.4, 3.2, 4
+    np.testing.assert_allclose(longer[0, :, 0, 0], [0.0, 0.8, 2.8, 6.0, 10.4, 16.0], rtol=1e-6)
+    np.testing.assert_allclose(resample.resize_corners(line, (3, 1))[0, :, 0, 0], [0.0, 4.0, 16.0], rtol=1e-6)
+    assert resample.resize_corners(line, (5, 1)) is line
+    # One pixel has no two corners.
+    np.testing.assert_allclose(resample.resize_corners(line[:, 3:4], (2, 3)), np.full((1, 2, 3, 1), 9.0), rtol=1e-6)
+    np.testing.assert_allclose(resample.resize_corners(line[:, 2:4], (1, 1)), [[[[6.5]]]], rtol=1e-6)
+
+
+def test_resizing_between_corners_is_numpys_interpolation_of_rows_and_columns(strict_dtypes):
+    x = np.random.default_rng(1).normal(size=(2, 5, 13, 3))
+    along = lambda x, size, axis: np.apply_along_axis(lambda line: np.interp(
+        np.linspace(0, len(line) - 1, size), np.arange(len(line)), line), axis, x)
+    got = resample.resize_corners(jnp.asarray(x, jnp.float32), (6, 14))
+    np.testing.assert_allclose(got, along(along(x, 6, 1), 14, 2), atol=1e-5)
+
+
 def test_mean_pool_cascade_keeps_the_mean(strict_dtypes):
     x = jnp.asarray(np.random.default_rng(0).normal(size=(2, 3, 4, 8, 3)), jnp.float32)
     half = resample.mean_pool2(x)

@@ -46,7 +46,7 @@ REPORT_FRAMES = 10
 Progress = Callable[[int, int], None]
 
 
-class Job(NamedTuple):
+class TownDrive(NamedTuple):
     """One run to record."""
 
     split: str
@@ -58,7 +58,7 @@ class Job(NamedTuple):
     restless: bool = False
 
 
-def jobs(size: str) -> list[Job]:
+def jobs(size: str) -> list[TownDrive]:
     """All runs of a size, in the order of splits.
 
     Raises:
@@ -66,7 +66,7 @@ def jobs(size: str) -> list[Job]:
     """
     if size not in settings.SIZES:
         raise ValueError(f"town size {size!r} is unknown; known are {', '.join(settings.SIZES)}.")
-    return [Job(split, f"{index:03d}_{plan.weathers[index % len(plan.weathers)]}", plan.first_seed + index,
+    return [TownDrive(split, f"{index:03d}_{plan.weathers[index % len(plan.weathers)]}", plan.first_seed + index,
                 plan.weathers[index % len(plan.weathers)], plan.frames, 1 + index % 2 if restless else 0, restless)
             for split, plan in settings.SIZES[size].items() for index in range(plan.runs)
             for restless in [index >= plan.runs - plan.restless]]
@@ -142,7 +142,7 @@ def describe(directory: pathlib.Path, town_config: settings.TownConfig, splits: 
                                voxels=town_config.voxels)
 
 
-def record_run(directory: pathlib.Path, town: Town, job: Job) -> Iterator[int]:
+def record_run(directory: pathlib.Path, town: Town, job: TownDrive) -> Iterator[int]:
     """Records one run, yielding 1 after each frame. A drive that ends early ends the run early."""
     writer = recorder.RunWriter(directory, job.split, job.run)
     state = town.reset(job.seed, job.weather)
@@ -172,7 +172,7 @@ def _chosen(town: Town, state: TownState, restless: bool) -> np.ndarray:
     return np.clip(np.where(sudden != 0, sudden, action), -1, 1).astype(np.float32)
 
 
-def _record_here(directory: pathlib.Path, town_config: settings.TownConfig, missing: list[Job]) -> Iterator[int]:
+def _record_here(directory: pathlib.Path, town_config: settings.TownConfig, missing: list[TownDrive]) -> Iterator[int]:
     yield from (count for job in missing for count in record_run(directory, _town(town_config, job.other_town), job))
 
 
@@ -181,7 +181,7 @@ def _town(town_config: settings.TownConfig, other: int) -> Town:
     return Town(dataclasses.replace(town_config, seed=town_config.seed + other))
 
 
-def _record_in_workers(directory: pathlib.Path, town_config: settings.TownConfig, missing: list[Job],
+def _record_in_workers(directory: pathlib.Path, town_config: settings.TownConfig, missing: list[TownDrive],
                        workers: int) -> Iterator[int]:
     """Deals the runs out to worker processes and yields the frames they report, a few at a time."""
     environment = {**os.environ, "JAX_PLATFORMS": "cpu", "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
@@ -229,11 +229,11 @@ def _work() -> None:
     order = json.load(sys.stdin)
     town_config = config_lib.parse(settings.TownConfig, order["town"], "town")
     for job in order["jobs"]:
-        frames, town = 0, _town(town_config, Job(*job).other_town)
-        for frames, _ in enumerate(record_run(pathlib.Path(order["directory"]), town, Job(*job)), start=1):
+        frames, town = 0, _town(town_config, TownDrive(*job).other_town)
+        for frames, _ in enumerate(record_run(pathlib.Path(order["directory"]), town, TownDrive(*job)), start=1):
             if frames % REPORT_FRAMES == 0:
                 _report(REPORT_FRAMES)
-        _report(Job(*job).frames - frames // REPORT_FRAMES * REPORT_FRAMES)
+        _report(TownDrive(*job).frames - frames // REPORT_FRAMES * REPORT_FRAMES)
 
 
 def _report(frames: int) -> None:

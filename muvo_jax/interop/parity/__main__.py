@@ -17,16 +17,16 @@ from muvo_jax.interop.parity import registry, runner
 class Options:
     """Compares this library with numbers that the authors' PyTorch code gave, on the same weights and inputs.
 
-    DIR holds packs (npz files) and pack.json with their seed and sizes; nothing in it is executed. Prints a line for
+    DIR holds golden files (npz) and pack.json with their seed and sizes; nothing in it is executed. Prints a line for
     each entry, then how many were checked and left out, and ends with 0 only where all passed.
     """
 
     folder: Annotated[pathlib.Path, tyro.conf.Positional, tyro.conf.arg(metavar="DIR")]
-    """The packs."""
+    """The golden files."""
     only: Annotated[str, command_line.shown("P1,P2", "all")] = ""
-    """Which packs, by the beginnings of their names: p1, p2, p3 (or p3_1d, p3_2d), p4, p5, p6."""
+    """Which golden files, by the beginnings of their names: p1, p2, p3 (or p3_1d, p3_2d), p4, p5, p6."""
     recordings: Annotated[pathlib.Path | None, command_line.shown("PATH", "none")] = None
-    """Recordings, for the packs that need some (p6)."""
+    """Recordings, for the golden files that need some (p6)."""
 
 
 _EXAMPLES = """
@@ -41,7 +41,7 @@ def main() -> int:
 
     def work(options: Options, show) -> None:
         only = [name for name in options.only.lower().split(",") if name]
-        report = runner.run_folder(options.folder, registry.PACKS, only=only, recordings=options.recordings,
+        report = runner.run_folder(options.folder, registry.FILES, only=only, recordings=options.recordings,
                                    write=lambda line: print(line, flush=True))
         for line in report.lines():
             print(line)

@@ -1,4 +1,4 @@
-"""Packs p5_losses_all: every loss term of the reference at once, on given predictions.
+"""Golden files p5_losses_all: every loss term of the reference at once, on given predictions.
 
 Among them are the terms of heads that the released models lack. The two code lines differ in three things: the 2D one
 trains occupancy by its geometric affinity alone, weighs structural similarity half as much, and has a perceptual term.
@@ -13,6 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from muvo_jax import config as config_lib
 from muvo_jax import types
 from muvo_jax.interop import reference_preprocess as preprocess
 from muvo_jax.interop.parity import cases, losses, raw_batch
@@ -29,19 +30,17 @@ _SIMILARITY_WEIGHT = {"1d": 0.6, "2d": 0.3}
 _BIRDVIEW: dict[str, Any] = {"weights": losses.SEGMENTATION_WEIGHTS, "top_share": 0.25}
 _LIDAR_CLASSES: dict[str, Any] = {"weights": losses.VOXEL_WEIGHTS, "top_share": 0.5}
 _IMAGE_CLASSES: dict[str, Any] = {"weights": losses.VOXEL_WEIGHTS}
-_FRAMES = 2
-_IMAGE, _RANGE, _CELLS, _GRID = (320, 832), raw_batch.RANGE_SIZE, (192, 192), raw_batch.VOXEL_SHAPE
-# Prediction -> channels, full size, kind.
-_OUTPUTS: dict[str, tuple[int, tuple[int, ...], str]] = {
-    "rgb": (3, _IMAGE, "smooth"), "lidar_reconstruction": (4, _RANGE, "smooth_pm1"),
-    "lidar_segmentation": (9, _RANGE, "smooth_pm1"), "semantic_image": (9, _IMAGE, "smooth_pm1"),
-    "depth": (1, _IMAGE, "smooth"), "bev_segmentation": (8, _CELLS, "smooth_pm1"),
-    "bev_instance_offset": (2, _CELLS, "smooth_pm1"), "bev_instance_center": (1, _CELLS, "smooth"),
-    "voxel": (2, _GRID, "smooth_pm1")}
+# Prediction -> channels, the label that has its size at each scale, kind.
+_OUTPUTS = {
+    "rgb": (3, "rgb_label", "smooth"), "lidar_reconstruction": (4, "range_view_label", "smooth_pm1"),
+    "lidar_segmentation": (9, "range_view_label", "smooth_pm1"), "semantic_image": (9, "rgb_label", "smooth_pm1"),
+    "depth": (1, "rgb_label", "smooth"), "bev_segmentation": (8, "birdview_label", "smooth_pm1"),
+    "bev_instance_offset": (2, "birdview_label", "smooth_pm1"),
+    "bev_instance_center": (1, "birdview_label", "smooth"), "voxel": (2, "voxel_label", "smooth_pm1")}
 
 
 def all_losses(context: cases.Context) -> Checks:
-    line = "2d" if context.pack.path.stem.endswith("2d") else "1d"
+    line = "2d" if context.file.path.stem.endswith("2d") else "1d"
     labels = _labels(context)
     for name, value in _latent_and_action(context, labels["action"]):
         yield cases.Check(f"loss/{name}", value, TOLERANCE)
@@ -51,28 +50,30 @@ def all_losses(context: cases.Context) -> Checks:
 
 
 def _labels(context: cases.Context) -> dict[str, np.ndarray]:
-    raw = raw_batch.draw_raw(context, _FRAMES, 3)
-    frames = (1, _FRAMES, 1)
-    draw = context.draw
+    count = context.size("p5", "losses_all_sequence")
+    raw = raw_batch.draw_raw(context, count, context.size("p4", "imagine"))
+    draw, frames = context.draw, (1, count, 1)
+    image_size, cells = context.size("p4", "image_hw"), context.size("p5", "birdview_hw")
     optional = preprocess.optional_labels({
-        "birdview": draw("pre_bev", (*frames, *_CELLS), "labels8"),
-        "instance": draw("pre_inst", (*frames, *_CELLS), "instance4"),
-        "depth": draw("pre_depth", (*frames, *raw_batch.IMAGE_SIZE), "smooth"),
-        "image_instance_mask": draw("pre_imask", (*frames, *raw_batch.IMAGE_SIZE), "mask"),
-        "semantic_image": draw("pre_sem", (*frames, *raw_batch.IMAGE_SIZE), "labels9"),
-        "range_view_pcd_seg": draw("pre_rvs", (*frames, *_RANGE), "labels9")})
-    return preprocess.network_inputs(raw) | optional | {"action": raw["action"][:, :_FRAMES]}
+        "birdview": draw("pre_bev", (*frames, *cells), "labels8"),
+        "instance": draw("pre_inst", (*frames, *cells), "instance4"),
+        "depth": draw("pre_depth", (*frames, *image_size), "smooth"),
+        "image_instance_mask": draw("pre_imask", (*frames, *image_size), "mask"),
+        "semantic_image": draw("pre_sem", (*frames, *image_size), "labels9"),
+        "range_view_pcd_seg": draw("pre_rvs", (*frames, *raw_batch.range_size(context)), "labels9")})
+    return preprocess.network_inputs(raw) | optional | {"action": raw["action"][:, :count]}
 
 
 def _latent_and_action(context: cases.Context, action: np.ndarray) -> Terms:
-    shape = (1, _FRAMES, 512)
+    frames = action.shape[:2]
+    shape = (*frames, config_lib.ModelConfig().stochastic_channels)
     posterior, prior = (types.Gaussian(*(jnp.asarray(context.draw(f"o_{side}_{moment}", shape, kind))
                                          for moment, kind in (("mu", "normal"), ("sigma", "sigma"))))
                         for side in ("posterior", "prior"))
     divergence = kl.balanced_kl_sums(posterior, prior, balance=_KL_BALANCE, numerics="reference")
     yield "probabilistic", _KL_WEIGHT * divergence.value()
     for column, (name, drawn) in enumerate((("throttle_brake", "o_tb"), ("steering", "o_st"))):
-        driven = jnp.asarray(context.draw(drawn, (1, _FRAMES, 1), "pm1"))
+        driven = jnp.asarray(context.draw(drawn, (*frames, 1), "pm1"))
         yield name, regression.l1_sums(driven, jnp.asarray(action[..., column:column + 1])).value()
 
 
@@ -81,9 +82,9 @@ def _maps(context: cases.Context, labels: dict[str, np.ndarray], scale: int, lin
     weight = _MAP_WEIGHT / scale
 
     def output(name: str) -> np.ndarray:
-        channels, size, kind = _OUTPUTS[name]
-        small = tuple(side // scale for side in size)
-        return context.draw(f"o_{name}_{scale}", (1, _FRAMES, channels, *small), kind)
+        channels, label, kind = _OUTPUTS[name]
+        batch, frames, _, *size = labels[f"{label}_{scale}"].shape
+        return context.draw(f"o_{name}_{scale}", (batch, frames, channels, *size), kind)
 
     rgb, target = output("rgb"), labels[f"rgb_label_{scale}"]
     of_instances = regression.l1_sums(_last(rgb), _last(target), _true(labels[f"image_instance_mask_{scale}"]))
@@ -135,7 +136,7 @@ def _occupancy(logits: jax.Array, target: np.ndarray, weight: float, line: str) 
 
 
 def _perceptual(prediction: np.ndarray, target: np.ndarray) -> jax.Array:
-    network, weights = losses.perceptual_network((_FRAMES, *prediction.shape[3:], 3))
+    network, weights = losses.perceptual_network((prediction.shape[1], *prediction.shape[3:], 3))
     maps = jax.jit(lambda weights, picture: losses.perceptual_maps(network, weights, picture))
     return perceptual.distance_sums(maps(weights, prediction), maps(weights, target)).terms("distance")["distance"]
 

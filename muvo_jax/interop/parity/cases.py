@@ -1,4 +1,4 @@
-"""What a parity check is made of: checks of entries, groups of them, and the packs that groups belong to."""
+"""What a parity check is made of: checks of entries, groups of them, and the golden files that groups belong to."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import re
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
-from muvo_jax.interop import packs
+from muvo_jax.interop.parity import golden
 
 
 @dataclasses.dataclass(frozen=True)
@@ -16,23 +16,30 @@ class Check:
     """One entry, computed anew.
 
     Attributes:
-      entry: its name in the pack; one that the pack lacks is passed over.
+      entry: its name in the file; one that the file lacks is passed over.
       got: our value, in torch's layout.
       tolerance: the largest error that passes.
-      measure: (pack, entry, got) -> error; by default that of packs.Pack.error.
-      stands_alone: whether the expected value lies elsewhere than in the pack (in `measure`).
-      again: the same value on weights that differ by rounding (drawing.rounded_anew), asked for only where `got` misses
-        the tolerance. At a kink of the function it is chance on which side float32 comes out, in the reference too, so
-        one of these may be its value. Of a smooth one this gives the mean over such weights (drawing.rounded_in_pairs),
-        from which our own rounding is gone.
+      measure: (file, entry, got) -> error; by default that of golden.File.error.
+      stands_alone: whether the expected value lies elsewhere than in the file (in `measure`).
+      again: the same value on weights or inputs that differ by rounding (rounding.anew), asked for only where `got`
+        misses the tolerance. At a kink of the function it is chance on which side float32 comes out, in the reference
+        too, so one of these may be its value.
+      roundings: the same value on weights moved back and forth (rounding.in_pairs), asked for only where `got` misses
+        the tolerance and the stored value is near zero; see rounding.error_near_zero.
+      noise: how far each value of the reference itself may be off, an array as `got`, where its formula rounds more
+        than ours; asked for only where `got` misses the tolerance.
+      note: what the line of the entry says in the end.
     """
 
     entry: str
     got: Any
     tolerance: float
-    measure: Callable[[packs.Pack, str, Any], float] = packs.Pack.error
+    measure: Callable[[golden.File, str, Any], float] = golden.File.error
     stands_alone: bool = False
     again: Callable[[], Iterator[Any]] | None = None
+    roundings: Callable[[], Iterator[Any]] | None = None
+    noise: Callable[[], Any] | None = None
+    note: str = ""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -40,26 +47,34 @@ class Context:
     """What a group of checks may read.
 
     Attributes:
-      pack: the file under test.
+      file: the file under test.
       settings: seed and sizes of its folder.
-      recordings: folder of recordings, for the packs that need some.
+      recordings: folder of recordings, for the golden files that need some.
     """
 
-    pack: packs.Pack
-    settings: packs.Settings
+    file: golden.File
+    settings: golden.Settings
     recordings: pathlib.Path | None = None
 
     def draw(self, name: str, shape: tuple[int, ...], kind: str):
         """An input by the rule, with the seed of the folder."""
         return self.settings.draw(name, shape, kind)
 
+    def size(self, *path: str) -> Any:
+        """A size by its place in pack.json, see golden.Settings.size."""
+        return self.settings.size(*path)
+
+    def shape(self, *entries: str) -> tuple[int, ...] | None:
+        """The shape of the first of some entries that the file holds; what an array shows goes before pack.json."""
+        return next((self.file.shape(entry) for entry in entries if entry in self.file), None)
+
 
 Group = Callable[[Context], Iterator[Check]]
 
 
 @dataclasses.dataclass(frozen=True)
-class PackChecks:
-    """How the entries of one kind of pack are computed.
+class FileChecks:
+    """How the entries of one kind of file are computed.
 
     Attributes:
       name: what --only selects.

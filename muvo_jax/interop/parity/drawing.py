@@ -10,7 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from muvo_jax.interop import names, weights_rule
-from muvo_jax.model import heads
+from muvo_jax.interop.parity import cases, rounding
+from muvo_jax.model import decoders, heads
 from muvo_jax.nn import norm
 
 EVAL = norm.Mode()
@@ -47,28 +48,6 @@ def draw_variables(shapes: Any, prefix: str = "", where: str = "",
     return jax.tree_util.tree_map_with_path(draw, shapes)
 
 
-def rounded_anew(variables: Any, tries: int = 32, size: float = 1e-7) -> Iterator[Any]:
-    """The variables as rounding could have left them: times 1 + size N(0, 1).
-
-    The noise of the packs was measured with 1e-7; what a deep network makes of its own rounding is about 1e-6.
-    """
-    return (_moved(variables, seed, size) for seed in range(tries))
-
-
-def rounded_in_pairs(variables: Any, pairs: int = 8, size: float = 1e-5) -> Iterator[Any]:
-    """The variables moved by 1 + size N(0, 1) and by 1 - size N(0, 1), in turns.
-
-    In the mean of what a smooth function makes of a pair the move itself is gone, to 1e-10; what is left are two
-    roundings that know nothing of each other, because the move is much larger than they are.
-    """
-    return (_moved(variables, seed, signed) for seed in range(pairs) for signed in (size, -size))
-
-
-def _moved(variables: Any, seed: int, size: float) -> Any:
-    normal = np.random.default_rng(seed).standard_normal
-    return jax.tree.map(lambda leaf: np.asarray(leaf * (1.0 + size * normal(leaf.shape)), np.float32), variables)
-
-
 def run(module, *args, prefix: str = "", where: str = "", rename: Callable[[str], str] | None = None,
         static: tuple = ()) -> Any:
     """Applies a module with drawn weights, jitted: module(*args, *static).
@@ -78,10 +57,26 @@ def run(module, *args, prefix: str = "", where: str = "", rename: Callable[[str]
       prefix, where, rename: see `draw_variables`.
       static: further arguments that are no arrays.
     """
+    variables, apply = prepared(module, *args, prefix=prefix, where=where, rename=rename, static=static)
+    return apply(variables)
+
+
+def prepared(module, *args, prefix: str = "", where: str = "", rename: Callable[[str], str] | None = None,
+             static: tuple = ()) -> tuple[Any, Callable[[Any], Any]]:
+    """Drawn weights of a module, and the function that `run` applies to them. Arguments as there."""
     args = tuple(jnp.asarray(arg) if isinstance(arg, np.ndarray) else arg for arg in args)
     shapes = jax.eval_shape(lambda key, *inputs: module.init(key, *inputs, *static), jax.random.key(0), *args)
     variables = draw_variables(shapes, prefix, where, rename)
-    return jax.jit(lambda variables, *inputs: module.apply(variables, *inputs, *static))(variables, *args)
+    apply = jax.jit(lambda variables, *inputs: module.apply(variables, *inputs, *static))
+    return variables, lambda variables: apply(variables, *args)
+
+
+def action_check(entry: str, module: decoders.ActionDecoder, features: np.ndarray, where: str,
+                 tolerance: float) -> cases.Check:
+    """Of an action of a decoder with drawn weights."""
+    variables, apply = prepared(module, features, where=where)
+    roundings = lambda: (apply(moved)[1] for moved in rounding.in_pairs(variables))
+    return cases.Check(entry, apply(variables)[1], tolerance, roundings=roundings)
 
 
 def birds_eye_entries(prefix: str, scales: Mapping[int, jax.Array], axis: int) -> Iterator[tuple[str, np.ndarray]]:

@@ -1,4 +1,4 @@
-"""Pack p1_losses_metrics: losses with their gradients, and metrics.
+"""File p1_losses_metrics: losses with their gradients, and metrics.
 
 Inputs are drawn in torch's layout; the gradient is taken with respect to the input in that layout, so that the change
 of layout is part of what is differentiated.
@@ -6,6 +6,7 @@ of layout is part of what is differentiated.
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
@@ -14,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from muvo_jax import types
-from muvo_jax.interop.parity import cases, drawing
+from muvo_jax.interop.parity import cases, drawing, rounding
 from muvo_jax.metrics import image as image_metrics
 from muvo_jax.metrics import occupancy, points, streaming
 from muvo_jax.model import camera
@@ -34,19 +35,25 @@ def _last(array: Any, axis: int = 2) -> jax.Array:
 
 def _loss(name: str, function: Callable[..., jax.Array], *args: np.ndarray,
           gradients: tuple[str, ...] = ("grad",)) -> Checks:
-    """Value and gradients of function(*args), one gradient for each of the first arguments."""
-    arrays = [jnp.asarray(arg) for arg in args]
-    value, slopes = jax.jit(jax.value_and_grad(function, argnums=tuple(range(len(gradients)))))(*arrays)
+    """Value and gradients of function(*args), one gradient for each of the first arguments.
+
+    Magnitudes, clipping, choices of the worst pixels or the nearest point have kinks, where a gradient may be another.
+    """
+    count = len(gradients)
+    differentiate = jax.jit(jax.value_and_grad(function, argnums=tuple(range(count))))
+    value, slopes = differentiate(*args)
     yield cases.Check(f"{name}/loss", value, LOSS_TOLERANCE)
-    for gradient, slope in zip(gradients, slopes, strict=True):
-        yield cases.Check(f"{name}/{gradient}", slope, GRADIENT_TOLERANCE)
+    for index, (gradient, slope) in enumerate(zip(gradients, slopes, strict=True)):
+        again = lambda index=index: (differentiate(*moved, *args[count:])[1][index]
+                                     for moved in rounding.anew(args[:count]))
+        yield cases.Check(f"{name}/{gradient}", slope, GRADIENT_TOLERANCE, again=again)
 
 
 def divergence(context: cases.Context) -> Checks:
     """Balanced and plain Kullback-Leibler divergence with the reference's rule for the first step."""
     gradients = ("grad_posterior_mu", "grad_posterior_sigma", "grad_prior_mu", "grad_prior_sigma")
     for tag in ("1d", "2d"):
-        shape = context.settings.size("p1", f"kl_{tag}")
+        shape = context.shape(f"kl0.75_{tag}/grad_prior_mu") or context.size("p1", f"kl_{tag}")
         moments = [context.draw(f"kl_{tag}_{side}_{moment}", shape, kind) for side in ("posterior", "prior")
                    for moment, kind in (("mu", "normal"), ("sigma", "sigma"))]
         if tag == "2d":
@@ -71,8 +78,8 @@ def divergence(context: cases.Context) -> Checks:
 
 
 def regressions(context: cases.Context) -> Checks:
-    for name, prefix, shape in (("regression", "act", context.settings.size("p1", "regression")),
-                                ("regression_c4", "reg3", context.settings.size("p1", "regression_c4"))):
+    for name, prefix in (("regression", "act"), ("regression_c4", "reg3")):
+        shape = context.shape(f"{name}_l1/grad", f"{name}_l2/grad") or context.size("p1", name)
         prediction, target = (context.draw(f"{prefix}_{side}", shape, "pm1") for side in ("pred", "tgt"))
         for norm, sums in (("l1", regression.l1_sums), ("l2", regression.l2_sums)):
             yield from _loss(f"{name}_{norm}", lambda prediction, target, sums=sums: sums(prediction, target).value(),
@@ -81,9 +88,9 @@ def regressions(context: cases.Context) -> Checks:
 
 def spatial(context: cases.Context) -> Checks:
     """Regression of maps; a pixel is ignored where the target's first channel is 255, or outside an instance mask."""
-    size = context.settings.size("p1", "spatial_hw")
-    prediction, target = (context.draw(f"sp_{side}", (2, 2, 3, *size), "normal") for side in ("pred", "tgt"))
-    masks = {kind: context.draw(f"sp_{drawn}", (2, 2, 1, *size), "mask")[:, :, 0]
+    shape = context.shape("spatial_l1/grad", "spatial_l2/grad") or (2, 2, 3, *context.size("p1", "spatial_hw"))
+    prediction, target = (context.draw(f"sp_{side}", shape, "normal") for side in ("pred", "tgt"))
+    masks = {kind: context.draw(f"sp_{drawn}", (*shape[:2], 1, *shape[3:]), "mask")[:, :, 0]
              for kind, drawn in (("ignore", "ign"), ("imask", "imask"))}
     kept = {"": None, "_ignore": ~masks["ignore"], "_imask": masks["imask"]}
     for norm, sums in (("l1", regression.l1_sums), ("l2", regression.l2_sums)):
@@ -96,8 +103,14 @@ def spatial(context: cases.Context) -> Checks:
     yield cases.Check("spatial_l1_allignored/loss", nothing, LOSS_TOLERANCE)
 
 
+def _voxel_sizes(context: cases.Context) -> tuple[int, ...]:
+    """Batch, frames and the sides of the grid."""
+    shape = context.shape("sem_scal_c2/grad", "voxel_ce_c2_plain/grad")
+    return (*shape[:2], *shape[3:]) if shape else context.size("p1", "voxel_bsxyz")
+
+
 def scene_class_affinity(context: cases.Context) -> Checks:
-    batch, frames, *grid = context.settings.size("p1", "voxel_bsxyz")
+    batch, frames, *grid = _voxel_sizes(context)
     logits = 3 * context.draw("vox_pred2", (batch, frames, 2, *grid), "pm1")
     sums = lambda logits, target: scal.occupancy_sums(_last(logits), target[:, :, 0])
     for suffix, kind in (("", "voxel2"), ("_ign", "voxel2_ign")):
@@ -113,11 +126,15 @@ def chamfer(context: cases.Context) -> Checks:
         flat = lambda clouds: clouds.reshape(-1, *clouds.shape[2:])
         return 2.0 * jax.vmap(nearest.chamfer)(flat(prediction), flat(target)).mean()
 
-    yield from _loss("cd_loss", value, *_clouds(context))
+    prediction, target = _clouds(context)
+    noise = lambda: rounding.chamfer_gradient_noise(*(cloud.reshape(-1, *cloud.shape[2:])
+                                                      for cloud in (prediction, target))).reshape(prediction.shape)
+    for check in _loss("cd_loss", value, prediction, target):
+        yield check if check.entry.endswith("/loss") else dataclasses.replace(check, again=None, noise=noise)
 
 
 def _clouds(context: cases.Context) -> tuple[np.ndarray, np.ndarray]:
-    shape = (2, 2, context.settings.size("p1", "chamfer_points"), 3)
+    shape = context.shape("cd_loss/grad") or (2, 2, context.size("p1", "chamfer_points"), 3)
     squashed = np.array([30.0, 30.0, 6.0], np.float32)
     prediction, target = (context.draw(f"cd_{side}", shape, "pm1") * squashed for side in ("pred", "tgt"))
     return prediction, target
@@ -171,7 +188,7 @@ def _geometric_scal(logits: jax.Array, target: jax.Array) -> jax.Array:
 
 def voxel_classes(context: cases.Context) -> Checks:
     """Cross-entropy, affinity and Dice terms of two and nine classes."""
-    batch, frames, *grid = context.settings.size("p1", "voxel_bsxyz")
+    batch, frames, *grid = _voxel_sizes(context)
     for classes in (2, 9):
         logits = 3 * context.draw(f"vox_pred{classes}", (batch, frames, classes, *grid), "pm1")
         draw = lambda suffix, classes=classes: context.draw(f"vox_tgt{classes}", (batch, frames, 1, *grid),
@@ -194,14 +211,14 @@ def voxel_classes(context: cases.Context) -> Checks:
 
 
 def segmentation(context: cases.Context) -> Checks:
-    size = context.settings.size("p1", "segmentation_hw")
+    shape = context.shape("seg_plain/grad") or (2, 2, 8, *context.size("p1", "segmentation_hw"))
     for name, prefix, classes, option in (
             ("seg_plain", "seg", 8, {}), ("seg_weights", "seg", 8, {"weights": SEGMENTATION_WEIGHTS}),
             ("seg_topk0.25_weights", "seg", 8, {"weights": SEGMENTATION_WEIGHTS, "top_share": 0.25}),
             ("seg_poly1", "seg", 8, {"poly": 1.0}),
             ("seg9_topk0.5_voxelweights", "seg9", 9, {"weights": VOXEL_WEIGHTS, "top_share": 0.5})):
-        logits = 3 * context.draw(f"{prefix}_pred", (2, 2, classes, *size), "pm1")
-        target = context.draw(f"{prefix}_tgt", (2, 2, 1, *size), f"labels{classes}")
+        logits = 3 * context.draw(f"{prefix}_pred", (*shape[:2], classes, *shape[3:]), "pm1")
+        target = context.draw(f"{prefix}_tgt", (*shape[:2], 1, *shape[3:]), f"labels{classes}")
         options: dict[str, Any] = dict(option)
         loss = lambda *args, options=options: cross_entropy(*args, **options)
         yield from _loss(name, loss, logits, target)
@@ -236,7 +253,7 @@ def chamfer_metrics(context: cases.Context) -> Checks:
 
 
 def class_scores(context: cases.Context) -> Checks:
-    shape = context.settings.size("p1", "ssc")
+    shape = context.size("p1", "ssc")
     for classes in (2, 9):
         truth = context.draw(f"ssc_true{classes}", shape, f"voxel{classes}_ign")
         keep = (context.draw(f"ssc_mix{classes}", shape, "uniform") < 0.7) & (truth != IGNORED)
@@ -265,9 +282,9 @@ def _binary_scores(prediction: np.ndarray, truths: list[np.ndarray],
 
 def perceptual_distances(context: cases.Context) -> Checks:
     """Distances of a ResNet-18's maps of the normalised pictures. Its ReLUs are kinks of the gradient."""
-    size = context.settings.size("p1", "perceptual_hw")
-    prediction, target = (context.draw(f"perc_{side}", (1, 2, 3, *size), "smooth") for side in ("pred", "tgt"))
-    network, weights = perceptual_network((2, *size, 3))
+    shape = context.shape("perceptual_l2/grad") or (1, 2, 3, *context.size("p1", "perceptual_hw"))
+    prediction, target = (context.draw(f"perc_{side}", shape, "smooth") for side in ("pred", "tgt"))
+    network, weights = perceptual_network((shape[0] * shape[1], *shape[3:], 3))
     maps = lambda picture, weights: perceptual_maps(network, weights, picture)
     for level, value in enumerate(jax.jit(maps)(prediction, weights)):
         yield cases.Check(f"perceptual_feat{level}", drawing.channels_first(value), PERCEPTUAL_TOLERANCES[0])
@@ -280,7 +297,7 @@ def perceptual_distances(context: cases.Context) -> Checks:
 
         differentiate = jax.jit(jax.value_and_grad(distance))
         again = lambda differentiate=differentiate: (differentiate(prediction, moved)[1]
-                                                     for moved in drawing.rounded_anew(weights))
+                                                     for moved in rounding.anew(weights))
         value, slope = differentiate(prediction, weights)
         yield cases.Check(f"perceptual_{name}/loss", value, PERCEPTUAL_TOLERANCES[0])
         yield cases.Check(f"perceptual_{name}/grad", slope, PERCEPTUAL_TOLERANCES[1], again=again)
@@ -317,8 +334,8 @@ def perceptual_maps(network: resnet.ResNet18, weights: Any, picture: jax.Array) 
 
 
 def _pictures(context: cases.Context) -> tuple[np.ndarray, np.ndarray]:
-    size = context.settings.size("p1", "ssim_hw")
-    target, noise = (context.draw(name, (2, 2, 3, *size), "smooth") for name in ("rgb_tgt", "rgb_pred"))
+    shape = context.shape("ssim/grad") or (2, 2, 3, *context.size("p1", "ssim_hw"))
+    target, noise = (context.draw(name, shape, "smooth") for name in ("rgb_tgt", "rgb_pred"))
     return np.float32(0.7) * target + np.float32(0.3) * noise, target
 
 

@@ -1,4 +1,4 @@
-"""Pack p3_modules_1d: the parts of the reference's 1D model, in evaluation mode."""
+"""File p3_modules_1d: the parts of the reference's 1D model, in evaluation mode."""
 
 from __future__ import annotations
 
@@ -25,9 +25,8 @@ Checks = Iterator[cases.Check]
 
 def backbones(context: cases.Context) -> Checks:
     for name, prefix, drawn, channels, size in (
-            ("encoder_resnet18", "encoder.", "enc_img", 3, context.settings.size("p3_1d", "image_hw")),
-            ("range_view_encoder_resnet18", "range_view_encoder.", "enc_rv", 4,
-             context.settings.size("p3_1d", "range_hw"))):
+            ("encoder_resnet18", "encoder.", "enc_img", 3, context.size("p3_1d", "image_hw")),
+            ("range_view_encoder_resnet18", "range_view_encoder.", "enc_rv", 4, context.size("p3_1d", "range_hw"))):
         image = drawing.channels_last(context.draw(drawn, (1, channels, *size), "smooth_pm1"))
         maps = drawing.run(resnet.ResNet18(CONFIG.backbone_width, (2, 3, 4)), image, prefix=prefix, static=_EVAL)
         for level, value in enumerate(maps):
@@ -35,7 +34,7 @@ def backbones(context: cases.Context) -> Checks:
 
 
 def necks(context: cases.Context) -> Checks:
-    sizes = context.settings.size("p3_1d", "fpn_hw")
+    sizes = context.size("p3_1d", "fpn_hw")
     maps = [drawing.channels_last(context.draw(f"fpn{level}", (1, channels, *size), "smooth_pm1"))
             for level, (channels, size) in enumerate(zip(_FPN_CHANNELS, sizes, strict=True))]
     for name, prefix, neck in (("DecoderDS", "feat_decoder", pyramid.DownsamplingPyramid),
@@ -46,7 +45,7 @@ def necks(context: cases.Context) -> Checks:
 
 
 def transformer(context: cases.Context) -> Checks:
-    shape = context.settings.size("p3_1d", "tokens")
+    shape = context.shape("transformer_encoder/out", "transformer_encoder/layer0") or context.size("p3_1d", "tokens")
     tokens = np.swapaxes(context.draw("tokens", shape, "normal"), 0, 1)
     size = (CONFIG.transformer_heads, CONFIG.transformer_hidden_channels, 0.0)
     first = drawing.run(attention.EncoderLayer(*size), tokens, where="fusion/transformer/layer0/", static=(None, 0))
@@ -58,10 +57,14 @@ def transformer(context: cases.Context) -> Checks:
 
 def compression(context: cases.Context) -> Checks:
     """Two residual blocks and a mean; the second block of the FC fusion's lidar path halves its map too."""
-    for name, channels, size, second_stride in (("image_feature_conv", 384, (10, 26), 1),
-                                                ("lidar_feature_conv", 384, (2, 32), 1),
-                                                ("lidar_state_conv", 64, (8, 128), 2)):
-        x = drawing.channels_last(context.draw(f"{name}_in", (2, channels, *size), "normal"))
+    for name, channels, second_stride in (("image_feature_conv", 384, 1), ("lidar_feature_conv", 384, 1),
+                                          ("lidar_state_conv", 64, 2)):
+        rows, size = 2, context.size("p3_1d", f"{name}_hw")
+        halved = context.shape(f"{name}/block0")
+        if halved:
+            rows = halved[0]
+            size = size if halved[2:] == tuple(-(-side // 2) for side in size) else tuple(2 * n for n in halved[2:])
+        x = drawing.channels_last(context.draw(f"{name}_in", (rows, channels, *size), "normal"))
         blocks = [resnet.BasicBlock(CONFIG.fused_channels, stride=stride, project=stride == 2)
                   for stride in (2, second_stride)]
         first = drawing.run(blocks[0], x, prefix=f"{name}.0.", static=_EVAL)
@@ -71,11 +74,13 @@ def compression(context: cases.Context) -> Checks:
 
 
 def measurements(context: cases.Context) -> Checks:
-    speed = context.draw("speed", (4, 1), "speed") / CONFIG.speed_scale_mps
+    count, *_ = context.shape("speed_enc/out") or (4,)
+    speed = context.draw("speed", (count, 1), "speed") / CONFIG.speed_scale_mps
     out = drawing.run(layers.Mlp((CONFIG.measurement_channels,) * 2), speed, where="speed/mlp/")
     yield cases.Check("speed_enc/out", jax.nn.relu(out), TOLERANCE)
-    # The pack feeds a map that is normalised already, of three different channels: enter behind the normalisation.
-    route = drawing.channels_last(context.draw("route", (2, 3, 64, 64), "smooth_pm1"))
+    # The file feeds a map that is normalised already, of three different channels: enter behind the normalisation.
+    count, *_ = context.shape("backbone_route/out") or (2,)
+    route = drawing.channels_last(context.draw("route", (count, 3, *context.size("p3_1d", "route_hw")), "smooth_pm1"))
     (deepest,) = drawing.run(resnet.ResNet18(CONFIG.backbone_width, (4,)), route, prefix="backbone_route.backbone.",
                              static=_EVAL)
     pooled = jnp.mean(deepest, axis=(1, 2))
@@ -84,16 +89,21 @@ def measurements(context: cases.Context) -> Checks:
 
 
 def decoded(context: cases.Context) -> Checks:
-    count = context.settings.size("p3_1d", "state_batch")
+    count, *_ = context.shape("policy/out") or (context.size("p3_1d", "state_batch"),)
     state = context.draw("state", (count, CONFIG.deterministic_channels + CONFIG.stochastic_channels), "normal")
-    plane = lambda size, channels: decoders.PlaneDecoder(size, channels, CONFIG.decoder_channels)
-    yield cases.Check("policy/out", drawing.run(decoders.ActionDecoder(), state, where="decoders_action/")[1],
-                      TOLERANCE)
+
+    def plane(entry: str, usual: tuple[int, ...], channels: int) -> decoders.PlaneDecoder:
+        rows, columns = (context.shape(f"{entry}_1") or usual)[-2:]
+        return decoders.PlaneDecoder((rows, columns), channels, CONFIG.decoder_channels)
+
+    yield drawing.action_check("policy/out", decoders.ActionDecoder(), state, "decoders_action/", TOLERANCE)
     voxels = decoders.StyledDecoder(CONFIG.voxels.shape, 2, 2 * CONFIG.occupancy_channels, CONFIG.occupancy_channels,
                                     CONFIG.occupancy_blocks)
     for module, rows, where, name, tolerance in (
-            (plane(CONFIG.image_size, 3), state[:1], "decoders_image/", "rgb_decoder/rgb", TOLERANCE),
-            (plane((64, 1024), 4), state, "decoders_range_view/", "lidar_re/lidar_reconstruction", TOLERANCE),
+            (plane("rgb_decoder/rgb", CONFIG.image_size, 3), state[:1], "decoders_image/", "rgb_decoder/rgb",
+             TOLERANCE),
+            (plane("lidar_re/lidar_reconstruction", context.size("p3_1d", "range_hw"), 4), state,
+             "decoders_range_view/", "lidar_re/lidar_reconstruction", TOLERANCE),
             (voxels, state[:1], "decoders_occupancy/", "voxel_decoder/voxel", STYLED_TOLERANCE)):
         for scale, value in drawing.run(module, rows, where=where).items():
             yield cases.Check(f"{name}_{scale}", drawing.channels_first(value), tolerance)
@@ -104,9 +114,17 @@ def decoded(context: cases.Context) -> Checks:
 
 
 def recurrent(context: cases.Context) -> Checks:
-    sizes = [context.settings.size("p3_1d", "rssm", name) for name in ("batch", "steps", "imagine")]
+    sizes = transition_sizes(context, "rssm", "p3_1d", "rssm")
     yield from transition_checks(context, CONFIG, "rssm", "rssm", *sizes,
                                  embedding=context.draw("rssm_emb", (*sizes[:2], CONFIG.embedding_channels), "normal"))
+
+
+def transition_sizes(context: cases.Context, label: str, *path: str) -> tuple[int, int, int]:
+    """Batch, observed steps and imagined ones, from the arrays of a transition's entries or else from pack.json."""
+    batch, steps, imagined = (context.size(*path, name) for name in ("batch", "steps", "imagine"))
+    observed, dreamt = (context.shape(f"{label}_sample0/{part}/mu", f"{label}_sample1/{part}/mu")
+                        for part in ("posterior", "imagine"))
+    return (*(observed[:2] if observed else (batch, steps)), dreamt[1] if dreamt else imagined)
 
 
 def transition_checks(context: cases.Context, config: config_lib.ModelConfig, name: str, label: str, batch: int,
@@ -122,7 +140,7 @@ def transition_checks(context: cases.Context, config: config_lib.ModelConfig, na
       batch, steps, imagined: sizes.
       embedding: [batch, steps, ...].
       rename: applied to the reference's keys.
-      moved: brings a latent [B, T, ...] into the layout of the pack.
+      moved: brings a latent [B, T, ...] into the layout of the file.
     """
     model = world_model.WorldModel(config)
     shapes = model.variable_shapes()["params"]["transition"]

@@ -1,4 +1,4 @@
-"""Pack p3_modules_2d: the parts of the reference's 2D model, in evaluation mode."""
+"""File p3_modules_2d: the parts of the reference's 2D model, in evaluation mode."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from muvo_jax.nn import resnet
 
 TOLERANCE, STYLED_TOLERANCE = modules_1d.TOLERANCE, modules_1d.STYLED_TOLERANCE
 CONFIG = config_lib.ModelConfig(latent="2d", numerics="reference")
-NARROW = dataclasses.replace(CONFIG, token_channels=48)  # the pack's small transition: 48 channels everywhere
+NARROW = dataclasses.replace(CONFIG, token_channels=48)  # the file's small transition: 48 channels everywhere
 Checks = Iterator[cases.Check]
 
 
@@ -25,10 +25,12 @@ def _narrow_key(key: str) -> str:
 
 def recurrent_units(context: cases.Context) -> Checks:
     """The inputs hold tokens before the batch."""
-    state, x = (np.swapaxes(context.draw(name, (33, 2, 384), "normal"), 0, 1) for name in ("gg_h", "gg_x"))
+    shape = context.shape("gru_glo/out") or (33, 2, 384)
+    state, x = (np.swapaxes(context.draw(name, shape, "normal"), 0, 1) for name in ("gg_h", "gg_x"))
     out = drawing.run(token_transition.TokenGRU(384), state, x, where="transition/gru/")
     yield cases.Check("gru_glo/out", np.swapaxes(out, 0, 1), TOLERANCE)
-    state, x = (context.draw(name, (11, 2, 48), "normal") for name in ("gp_h", "gp_x"))
+    shape = context.shape("gru_plain/out") or (11, 2, 48)
+    state, x = (context.draw(name, shape, "normal") for name in ("gp_h", "gp_x"))
     out = drawing.run(unused_modules.PlainTokenGRU(48), state, x, prefix="gru_plain.")
     yield cases.Check("gru_plain/out", out, TOLERANCE)
 
@@ -36,7 +38,7 @@ def recurrent_units(context: cases.Context) -> Checks:
 def representations(context: cases.Context) -> Checks:
     for name, drawn, config, rename in (("representation_td384", "rep_mem", CONFIG, None),
                                         ("representation_td48", "rep_mem48", NARROW, _narrow_key)):
-        memory = np.swapaxes(context.draw(drawn, context.settings.size("p3_2d", drawn), "normal"), 0, 1)
+        memory = np.swapaxes(context.draw(drawn, context.size("p3_2d", drawn), "normal"), 0, 1)
         out = drawing.run(token_transition.TokenGaussianHead(config), memory, where="transition/prior/", rename=rename,
                           static=(None, 0))
         yield cases.Check(f"{name}/mu", np.swapaxes(out.mean, 0, 1), TOLERANCE)
@@ -44,15 +46,16 @@ def representations(context: cases.Context) -> Checks:
 
 
 def narrow_transition(context: cases.Context) -> Checks:
-    yield from _transition(context, "48", NARROW, 90, _narrow_key)
+    yield from _transition(context, "48", NARROW, _narrow_key)
 
 
 def transition(context: cases.Context) -> Checks:
-    yield from _transition(context, "384", CONFIG, 518, None)
+    yield from _transition(context, "384", CONFIG, None)
 
 
-def _transition(context: cases.Context, name: str, config: config_lib.ModelConfig, tokens: int, rename) -> Checks:
-    sizes = [context.settings.size("p3_2d", f"rssmtd{name}", field) for field in ("batch", "steps", "imagine")]
+def _transition(context: cases.Context, name: str, config: config_lib.ModelConfig, rename) -> Checks:
+    sizes = modules_1d.transition_sizes(context, f"rssmtd{name}", "p3_2d", f"rssmtd{name}")
+    tokens = context.size("p3_2d", f"rssmtd{name}", "tokens")
     embedding = context.draw(f"td{name}_emb", (*sizes[:2], config.token_channels, tokens), "normal")
     yield from modules_1d.transition_checks(
         context, config, f"td{name}", f"rssmtd{name}", *sizes, embedding=np.swapaxes(embedding, 2, 3), rename=rename,
@@ -63,24 +66,32 @@ def decoded(context: cases.Context) -> Checks:
     width = CONFIG.decoder_channels
     plane = lambda channels, stages: token_decoders.TokenDecoder(channels, width, width, stages)
     voxels = token_decoders.TokenDecoder(2, 2 * CONFIG.occupancy_channels, CONFIG.occupancy_channels, 1)
-    for module, grid, where, name, entry in (
-            (plane(3, 2), (10, 26), "decoders_image/", "rgb_decoder", "rgb"),
-            (plane(4, 1), (4, 64), "decoders_range_view/", "lidar_re", "lidar_reconstruction"),
-            (voxels, (12, 12, 4), "decoders_occupancy/", "voxel_decoder", "voxel")):
+    for module, factor, usual, where, name, entry in (
+            (plane(3, 2), 32, (10, 26), "decoders_image/", "rgb_decoder", "rgb"),
+            (plane(4, 1), 16, (4, 64), "decoders_range_view/", "lidar_re", "lidar_reconstruction"),
+            (voxels, 16, (12, 12, 4), "decoders_occupancy/", "voxel_decoder", "voxel")):
+        grid = _grid(context, f"{name}/{entry}_1", factor) or usual
         tokens = drawing.channels_last(context.draw(f"{name}_in", (1, CONFIG.token_channels, *grid), "normal"))
         for scale, value in drawing.run(module, tokens, where=where).items():
             tolerance = STYLED_TOLERANCE if name == "voxel_decoder" else TOLERANCE
             yield cases.Check(f"{name}/{entry}_{scale}", drawing.channels_first(value), tolerance)
     channels = heads.TABLE["birds_eye"].channels_of(CONFIG)
     birds_eye = token_decoders.TokenDecoder(channels, width, width, 1, head=decoders.BirdsEyeHead)
-    # The pack feeds the ground plan itself.
-    plan = drawing.channels_last(context.draw("bev_decoder_in", (1, CONFIG.token_channels, 12, 12), "normal"))
+    # The file feeds the ground plan itself.
+    grid = _grid(context, "bev_decoder/bev_segmentation_1", 16) or (12, 12)
+    plan = drawing.channels_last(context.draw("bev_decoder_in", (1, CONFIG.token_channels, *grid), "normal"))
     for entry, value in drawing.birds_eye_entries("bev_decoder", drawing.run(
             birds_eye, plan, where="decoders_birds_eye/"), 1):
         yield cases.Check(entry, value, TOLERANCE)
-    tokens = context.draw("pol_in", (3, CONFIG.token_channels), "normal")
-    yield cases.Check("policy/out", drawing.run(decoders.ActionDecoder(), tokens, where="decoders_action/")[1],
-                      TOLERANCE)
+    count, *_ = context.shape("policy/out") or (3,)
+    tokens = context.draw("pol_in", (count, CONFIG.token_channels), "normal")
+    yield drawing.action_check("policy/out", decoders.ActionDecoder(), tokens, "decoders_action/", TOLERANCE)
+
+
+def _grid(context: cases.Context, entry: str, factor: int) -> tuple[int, ...] | None:
+    """The grid of tokens that a decoder enlarges by `factor` to [1, C, *sides]."""
+    shape = context.shape(entry)
+    return tuple(side // factor for side in shape[2:]) if shape else None
 
 
 def unused_style_decoders(context: cases.Context) -> Checks:
@@ -95,7 +106,7 @@ def unused_style_decoders(context: cases.Context) -> Checks:
 
 
 def backbone(context: cases.Context) -> Checks:
-    image = context.draw("enc_rv", (1, 4, *context.settings.size("p3_2d", "range_hw")), "smooth_pm1")
+    image = context.draw("enc_rv", (1, 4, *context.size("p3_2d", "range_hw")), "smooth_pm1")
     maps = drawing.run(resnet.ResNet18(CONFIG.backbone_width, (1, 2, 3)), drawing.channels_last(image),
                        prefix="range_view_encoder.", static=(drawing.EVAL,))
     for level, value in enumerate(maps):

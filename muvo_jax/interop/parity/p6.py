@@ -1,4 +1,4 @@
-"""Pack p6: what the authors' CarlaDataset picks and reads from recordings in the MUVO layout, against our reader.
+"""File p6: what the authors' CarlaDataset picks and reads from recordings in the MUVO layout, against our reader.
 
 p6_pointers.json says which frames their class picks, under which settings, and p6_dataset.npz what it reads. All is
 computed again from the recordings: the range view by ops/range_view.py in float32, all else exactly. Where the authors
@@ -8,6 +8,7 @@ view than the recording's), this module follows them.
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import math
 import random
@@ -19,15 +20,15 @@ from typing import Any
 import numpy as np
 import scipy.ndimage
 
+from muvo_jax import config as config_lib
 from muvo_jax.data import carla, carla_files, carla_runs, files, schema
-from muvo_jax.interop import packs
-from muvo_jax.interop.parity import cases
+from muvo_jax.interop.parity import cases, golden
 from muvo_jax.ops import camera as camera_ops
 from muvo_jax.ops import range_view as range_view_ops
 
 POINTERS_FILE = "p6_pointers.json"
 _ROWS_HZ = 10.0
-_MAX_POINTS = 60_000
+_MOST_POINTS, _BIRDVIEW_SIDE = 60_000, 192  # where the arrays do not say
 _VEHICLE_BITS = (1 << carla_files.BIRDVIEW_BITS.index("vehicle")) | (1 << carla_files.BIRDVIEW_BITS.index("pedestrian"))
 # Of the range view: share of the pixels that may differ, and how much the others may.
 _PIXEL_SHARE, _XYZ_M, _RANGE_M = 5e-4, 1e-5, 1e-4
@@ -38,17 +39,17 @@ class _Recordings:
     """What both groups read first.
 
     Raises:
-      PackError: where p6_pointers.json is missing or unreadable.
+      GoldenError: where p6_pointers.json is missing or unreadable.
       DataError: where the recordings are.
     """
 
     def __init__(self, context: cases.Context):
         assert context.recordings is not None
-        path = context.pack.path.with_name(POINTERS_FILE)
+        path = context.file.path.with_name(POINTERS_FILE)
         try:
             self.expected = json.loads(path.read_text(encoding="utf-8"))
         except (OSError, ValueError) as error:
-            raise packs.PackError(f"{path}: expected the pointers of the pack ({error}).") from error
+            raise golden.GoldenError(f"{path}: expected the pointers of the file ({error}).") from error
         self.config = self.expected["config"]
         self.runs = carla_runs.find_runs(context.recordings)
 
@@ -58,7 +59,8 @@ def batches(context: cases.Context) -> Checks:
     recordings = _Recordings(context)
     for name, described in recordings.expected["batches"].items():
         yield from _batch(name, described, recordings)
-    yield cases.Check("bev_out_of_view_mask", _out_of_view(recordings.config), 0.0, _different)
+    side, *_ = context.shape("bev_out_of_view_mask") or (_BIRDVIEW_SIDE,)
+    yield cases.Check("bev_out_of_view_mask", _out_of_view(recordings.config, side), 0.0, _different)
 
 
 def _alone(name: str, ours: Any, theirs: Any) -> cases.Check:
@@ -129,7 +131,8 @@ def _batch(batch: str, described: Mapping, recordings: _Recordings) -> Checks:
     run = next((run for run in recordings.runs if (run.split, _short(run)) == place), None)
     if run is None:
         raise schema.DataError(f"the recordings have no run {place[1]} in {place[0]}, which {batch} was read from.")
-    frames = [_read_frame(run, row, recordings.config) for row in described["frames"]]
+    shapes = {name: form["shape"] for name, form in described["entries"].items()}
+    frames = [_read_frame(run, row, recordings.config, shapes) for row in described["frames"]]
     for name, form in described["entries"].items():
         if name not in frames[0]:
             raise schema.DataError(f"{batch}/{name}: the recordings do not hold it.")
@@ -144,18 +147,23 @@ def _batch(batch: str, described: Mapping, recordings: _Recordings) -> Checks:
             yield cases.Check(f"{batch}/{name}", ours, *_MEASURES.get(name, (0.0, _different)))
 
 
-def _read_frame(run: carla_runs.Run, row: int, config: Mapping) -> dict[str, np.ndarray]:
-    """One frame under the names and in the form of the authors' batches, all of their optional entries included."""
+def _read_frame(run: carla_runs.Run, row: int, config: Mapping, shapes: Mapping) -> dict[str, np.ndarray]:
+    """One frame under the names and in the form of the authors' batches, all of their optional entries included.
+
+    `shapes` are those of the batch's entries: the recording does not say how large range views and clouds are.
+    """
+    *_, rows, columns = shapes.get("range_view_pcd_xyzd", (carla.LIDAR.rows, carla.LIDAR.columns))
+    *_, most_points, _ = shapes.get("points_raw", (_MOST_POINTS, 3))
+    lidar = dataclasses.replace(carla.LIDAR, rows=rows, columns=columns)
     action = carla_runs.actions(run)[row]
-    position_m = carla.LIDAR.position_m
     image = files.read_image(run.path("image", row), "RGB")
     depth, tags = carla_files.read_depth_semantic(run.path("depth_semantic", row))
     birdview = carla_files.read_birdview(run.path("birdview", row))
-    scan = carla_files.read_points(run.path("points_semantic", row), position_m)
+    scan = carla_files.read_points(run.path("points_semantic", row), lidar.position_m)
     height_px, width_px = config["IMAGE_SIZE"]
     classes = carla_files.is_occupied(tags).astype(np.int64)
-    raw = np.zeros((_MAX_POINTS, 3), np.float32)
-    raw[:len(scan.points_m)] = scan.points_m
+    raw = np.zeros((most_points, 3), np.float32)
+    raw[:len(scan.points_m)] = scan.points_m[:most_points]
     bits = int(run.columns["n_classes"][row])
     planes = _bit_planes(birdview, bits)
     frame = {
@@ -164,7 +172,7 @@ def _read_frame(run: carla_runs.Run, row: int, config: Mapping) -> dict[str, np.
         "birdview": planes.astype(np.float32),
         "birdview_label": np.where(planes, np.arange(bits)[:, None, None], 0).max(axis=0)[None],
         "instance_label": scipy.ndimage.label(birdview & _VEHICLE_BITS)[0][None].astype(np.int32),
-        "range_view_pcd_xyzd": range_view_ops.project(scan.points_m, carla.LIDAR).transpose(2, 0, 1),
+        "range_view_pcd_xyzd": range_view_ops.project(scan.points_m, lidar).transpose(2, 0, 1),
         "points_raw": raw, "num_points": np.int64(len(scan.points_m)),
         "image_instance_mask": np.isin(tags, (carla_files.PEDESTRIAN, carla_files.VEHICLE))[None],
         "semantic_image": classes[None], "depth": np.where(depth > 0.999, -1.0, depth)[None],
@@ -175,7 +183,7 @@ def _read_frame(run: carla_runs.Run, row: int, config: Mapping) -> dict[str, np.
         "extrinsics": camera_ops.level_camera_to_ego(carla.MOUNT_M),
     }
     if scan.tags is not None:
-        frame["range_view_pcd_seg"] = _range_classes(scan)[None]
+        frame["range_view_pcd_seg"] = _range_classes(scan, lidar)[None]
     if "voxel_path" in run.columns:
         frame["voxel"] = carla_files.read_voxels(run.path("voxel", row), carla.VOXELS)[None]
     return frame
@@ -185,9 +193,9 @@ def _bit_planes(birdview: np.ndarray, bits: int) -> np.ndarray:
     return (birdview[None] >> np.arange(bits, dtype=np.uint16)[:, None, None] & 1).astype(bool)
 
 
-def _range_classes(scan: carla_files.Points) -> np.ndarray:
+def _range_classes(scan: carla_files.Points, geometry: config_lib.RangeViewGeometry) -> np.ndarray:
     """Class of the nearest point of each pixel, in float64 as the authors compute it; 0 where empty."""
-    geometry, points_m = carla.LIDAR, scan.points_m.astype(np.float64)
+    points_m = scan.points_m.astype(np.float64)
     relative_m = points_m - np.asarray(geometry.position_m)[None]
     range_m = np.sqrt((relative_m ** 2).sum(axis=1))
     yaw_rad = np.arctan2(relative_m[:, 1], relative_m[:, 0])
@@ -202,13 +210,13 @@ def _range_classes(scan: carla_files.Points) -> np.ndarray:
     return classes
 
 
-def _out_of_view(config: Mapping) -> np.ndarray:
-    """bool [192, 192], the birdview cells that the cropped camera image cannot show; row 0 is farthest ahead.
+def _out_of_view(config: Mapping, side: int) -> np.ndarray:
+    """bool [side, side], the birdview cells that the cropped camera image cannot show; row 0 is farthest ahead.
 
     The authors' configuration: cells of 0.2 m, ego 32 cells above the bottom edge, camera 1 m ahead of it, image
     columns 64 to 895 of 960.
     """
-    side, cell_m, crop = 192, 0.2, (64, 896)
+    cell_m, crop = 0.2, (64, 896)
     focal_px = camera_ops.intrinsics_from_fov(config["IMAGE_SIZE"][1], config["IMAGE_SIZE"][0],
                                               math.radians(config["IMAGE_FOV"]))[0, 0].astype(np.float64)
     behind = int(32 + 1.0 / cell_m)
@@ -219,32 +227,32 @@ def _out_of_view(config: Mapping) -> np.ndarray:
     return np.concatenate([hidden, np.ones((behind, side), bool)])
 
 
-def _different(pack: packs.Pack, entry: str, got: np.ndarray) -> float:
+def _different(file: golden.File, entry: str, got: np.ndarray) -> float:
     """0 where equal: by checksum where there is one, else by all stored values. Minus zero equals zero."""
-    checksum = pack.arrays.get(f"{entry}::crc32")
+    checksum = file.arrays.get(f"{entry}::crc32")
     if checksum is not None:
         if zlib.crc32(np.ascontiguousarray(got.astype(np.int64)).tobytes()) == int(checksum[0]):
             return 0.0
-        return max(_share(pack, entry, got), 1.0 / max(got.size, 1))
-    return _share(pack, entry, got)
+        return max(_share(file, entry, got), 1.0 / max(got.size, 1))
+    return _share(file, entry, got)
 
 
-def _share(pack: packs.Pack, entry: str, got: np.ndarray) -> float:
+def _share(file: golden.File, entry: str, got: np.ndarray) -> float:
     """Of the values stored, those that differ; all where there are not as many of them."""
     try:
-        return pack.share_different(entry, got)
+        return file.share_different(entry, got)
     except ValueError:
         return 1.0
 
 
-def _absolute(pack: packs.Pack, entry: str, got: np.ndarray) -> float:
-    stored = pack.arrays[entry] if entry in pack.arrays else pack.arrays[f"{entry}::sub"]
-    have = got if entry in pack.arrays else got.reshape(-1)[::int(pack.arrays[f"{entry}::meta"][0])]
+def _absolute(file: golden.File, entry: str, got: np.ndarray) -> float:
+    stored = file.arrays[entry] if entry in file.arrays else file.arrays[f"{entry}::sub"]
+    have = got if entry in file.arrays else got.reshape(-1)[::int(file.arrays[f"{entry}::meta"][0])]
     return float(np.abs(have.astype(np.float64) - stored).max(initial=0.0))
 
 
 # How far an entry may be off; what is not named must be equal.
-_MEASURES = {"intrinsics": (1e-6, packs.Pack.error), "depth": (1e-7, _absolute), "depth_color": (1e-7, _absolute)}
+_MEASURES = {"intrinsics": (1e-6, golden.File.error), "depth": (1e-7, _absolute), "depth_color": (1e-7, _absolute)}
 
 
 def _range_view(batch: str, ours: np.ndarray) -> Checks:
@@ -255,18 +263,18 @@ def _range_view(batch: str, ours: np.ndarray) -> Checks:
     flat = ours.transpose(0, 2, 3, 1).reshape(-1, 4)
     mine = np.flatnonzero(flat[:, 3] >= 0)
 
-    def pixels(pack: packs.Pack, entry: str, got: np.ndarray) -> float:
-        return len(np.setxor1d(got, pack[entry])) / max(len(pack[entry]), 1)
+    def pixels(file: golden.File, entry: str, got: np.ndarray) -> float:
+        return len(np.setxor1d(got, file[entry])) / max(len(file[entry]), 1)
 
-    def values(pack: packs.Pack, entry: str, got: np.ndarray) -> float:
-        theirs = pack[f"{batch}/range_view@pixels"]
+    def values(file: golden.File, entry: str, got: np.ndarray) -> float:
+        theirs = file[f"{batch}/range_view@pixels"]
         both = np.isin(theirs, mine)
-        off_m = np.abs(got[theirs[both]] - pack[entry][both])
+        off_m = np.abs(got[theirs[both]] - file[entry][both])
         return float(((off_m[:, :3].max(axis=1) > _XYZ_M) | (off_m[:, 3] > _RANGE_M)).mean()) if len(off_m) else 1.0
 
-    def image(pack: packs.Pack, entry: str, got: np.ndarray) -> float:
-        stored = pack.arrays[f"{entry}::sub"]
-        have = got.reshape(-1)[::int(pack.arrays[f"{entry}::meta"][0])]
+    def image(file: golden.File, entry: str, got: np.ndarray) -> float:
+        stored = file.arrays[f"{entry}::sub"]
+        have = got.reshape(-1)[::int(file.arrays[f"{entry}::meta"][0])]
         return float((np.abs(have - stored) > _RANGE_M).mean())
 
     yield cases.Check(f"{batch}/range_view@pixels", mine, _PIXEL_SHARE, pixels)

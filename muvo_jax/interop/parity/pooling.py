@@ -1,4 +1,4 @@
-"""Pack p2_geometry, pooling into cells of the ground: image features along their rays, and points in pillars."""
+"""File p2_geometry, pooling into cells of the ground: image features along their rays, and points in pillars."""
 
 from __future__ import annotations
 
@@ -10,9 +10,8 @@ import numpy as np
 
 from muvo_jax import config as config_lib
 from muvo_jax.geometry import BirdsEyeGrid
-from muvo_jax.interop import packs
 from muvo_jax.interop import reference_preprocess as preprocess
-from muvo_jax.interop.parity import cases, drawing
+from muvo_jax.interop.parity import cases, drawing, golden, rounding
 from muvo_jax.model import lidar
 from muvo_jax.nn import norm
 from muvo_jax.ops import frustum, resample
@@ -20,35 +19,61 @@ from muvo_jax.ops import frustum, resample
 Checks = Iterator[cases.Check]
 TOLERANCE, GRADIENT_TOLERANCE, SHARE_TOLERANCE = 1e-5, 1e-4, 1e-4
 _GRID = BirdsEyeGrid()
-_RAW_SIZE = (600, 960)
-_FRUSTA = {"small": (2, 5, 13, 3, 64), "full": (None, 40, 104, 4, 8)}  # batch, rows, columns, channels, stride
 
 
 def frusta(context: cases.Context) -> Checks:
     """Sums over the cells of features that lie on rays, of all distances and of the most probable ones."""
-    for tag, (batch, rows, columns, channels, stride) in _FRUSTA.items():
-        batch = batch or context.settings.size("p2", "frustum_full_batch")
-        bins, side = _GRID.depth_bins, _GRID.cells
-        draw = lambda name, *shape, tag=tag: context.draw(f"fp_{tag}_{name}", shape, "normal")
-        matrix = preprocess.cropped_intrinsics(preprocess.intrinsics(_RAW_SIZE))
-        repeat = lambda value, batch=batch: jnp.asarray(np.repeat(value[None], batch, 0), jnp.float32)
-        points = frustum.frustum_points(repeat(matrix), repeat(preprocess.camera_to_ego()), (rows, columns), stride,
-                                        bins, corners=True)
-        yield cases.Check(f"frustum/{tag}_geometry", np.asarray(points)[:, None], TOLERANCE)
-        cells = frustum.cell_indices(points, _GRID, truncate=True).reshape(batch, -1)
-        probabilities = jax.nn.softmax(jnp.asarray(2 * draw("logit", batch, bins, rows, columns)), axis=1)
-        depth = jnp.tensordot(probabilities, jnp.arange(1, bins + 1, dtype=jnp.float32), ((1,), (0,)))
-        full_size = resample.upsample_linear(depth[..., None], stride)
-        yield cases.Check(f"frustum/{tag}_depthmap", drawing.channels_first(full_size), TOLERANCE)
-        values = jnp.asarray(draw("x", batch, 1, bins, rows, columns, channels).reshape(batch, -1, channels))
-        weights = jnp.asarray(drawing.channels_last(draw("gw", batch, channels, side, side)))
-        lifted = jnp.where(_most_probable(probabilities).reshape(batch, -1), cells, side**2)
-        for kind, places in (("dense", cells), ("sparse", lifted)):
-            pooled, gradient = _pooled(values, places, weights)
-            yield cases.Check(f"frustum/{tag}_{kind}_out_f64accum", drawing.channels_first(pooled), TOLERANCE)
-            gradient = np.asarray(gradient).reshape(batch, 1, bins, rows, columns, channels)
-            for mode in ("eval", "train"):  # two ways to the same gradient, in the reference
-                yield cases.Check(f"frustum/{tag}_{kind}_{mode}_grad", gradient, GRADIENT_TOLERANCE)
+    for tag in ("small", "full"):
+        yield from _frustum(context, tag)
+
+
+def _frustum(context: cases.Context, tag: str) -> Checks:
+    batch, rows, columns, channels, stride = _frustum_sizes(context, tag)
+    bins, side = _GRID.depth_bins, _GRID.cells
+    draw = lambda name, *shape: context.draw(f"fp_{tag}_{name}", shape, "normal")
+    matrix = preprocess.cropped_intrinsics(preprocess.intrinsics(context.size("p2", "image_hw")))
+    repeat = lambda value: jnp.asarray(np.repeat(value[None], batch, 0), jnp.float32)
+    points = frustum.frustum_points(repeat(matrix), repeat(preprocess.camera_to_ego()), (rows, columns), stride, bins,
+                                    corners=True)
+    yield cases.Check(f"frustum/{tag}_geometry", np.asarray(points)[:, None], TOLERANCE)
+    cells = frustum.cell_indices(points, _GRID, truncate=True).reshape(batch, -1)
+    probabilities = jax.nn.softmax(jnp.asarray(2 * draw("logit", batch, bins, rows, columns)), axis=1)
+    depth = jnp.tensordot(probabilities, jnp.arange(1, bins + 1, dtype=jnp.float32), ((1,), (0,)))
+    full_size = resample.upsample_linear(depth[..., None], stride)
+    yield cases.Check(f"frustum/{tag}_depthmap", drawing.channels_first(full_size), TOLERANCE)
+    values = jnp.asarray(draw("x", batch, 1, bins, rows, columns, channels).reshape(batch, -1, channels))
+    weights = jnp.asarray(drawing.channels_last(draw("gw", batch, channels, side, side)))
+
+    def pooled(places: jax.Array) -> tuple[np.ndarray, np.ndarray]:
+        out, gradient = _pooled(values, places, weights)
+        return drawing.channels_first(out), np.asarray(gradient).reshape(batch, 1, bins, rows, columns, channels)
+
+    def sparse(probabilities: jax.Array) -> tuple[np.ndarray, np.ndarray]:
+        return pooled(jnp.where(_most_probable(probabilities).reshape(batch, -1), cells, side**2))
+
+    # Which bins are the most probable ones is a choice: a jump where two of them tie.
+    otherwise = [lambda part=part: (sparse(moved)[part] for moved in rounding.anew(probabilities)) for part in (0, 1)]
+    for kind, (out, gradient), again in (("dense", pooled(cells), (None, None)),
+                                         ("sparse", sparse(probabilities), otherwise)):
+        yield cases.Check(f"frustum/{tag}_{kind}_out_f64accum", out, TOLERANCE, again=again[0])
+        for mode in ("eval", "train"):  # two ways to the same gradient, in the reference
+            yield cases.Check(f"frustum/{tag}_{kind}_{mode}_grad", gradient, GRADIENT_TOLERANCE, again=again[1])
+
+
+def _frustum_sizes(context: cases.Context, tag: str) -> tuple[int, ...]:
+    """Batch, rows, columns and channels of the features, and how many pixels of the image a row of them is."""
+    sizes = list(context.size("p2", f"frustum_{tag}"))
+    if tag == "full":
+        sizes[0] = context.size("p2", "frustum_full_batch")
+    geometry, pooled = context.shape(f"frustum/{tag}_geometry"), context.shape(f"frustum/{tag}_dense_out_f64accum")
+    if geometry:
+        sizes[0], sizes[1], sizes[2] = geometry[0], *geometry[3:5]
+    if pooled:
+        sizes[0], sizes[3] = pooled[:2]
+    image = context.shape(f"frustum/{tag}_depthmap")
+    if image:
+        sizes[4] = image[2] // sizes[1]
+    return tuple(sizes)
 
 
 def _most_probable(probabilities: jax.Array) -> jax.Array:
@@ -66,14 +91,14 @@ def _pooled(values: jax.Array, cells: jax.Array, weights: jax.Array) -> tuple[ja
 
 def point_pillars(context: cases.Context) -> Checks:
     """The net of the pillars; values are compared in the pillars that the reference found occupied."""
-    sizes = context.settings.size
-    clouds = [context.draw(f"pp_cloud{index}", (sizes("p2", "pillar_points"),), "cloud") for index in (0, 1)]
+    count = jnp.asarray(context.size("p2", "pillar_counts"), jnp.int32)
+    clouds = [context.draw(f"pp_cloud{index}", (context.size("p2", "pillar_points"),), "cloud")
+              for index in range(len(count))]
     points = jnp.asarray(np.stack(clouds).astype(np.float32))
-    count = jnp.asarray(sizes("p2", "pillar_counts"), jnp.int32)
     net = lidar.PillarNet(config_lib.ModelConfig(numerics="reference"))
     shapes = jax.eval_shape(lambda key: net.init(key, points, count, drawing.EVAL), jax.random.key(0))
     variables = drawing.draw_variables(shapes, where="lidar/pillars/")
-    occupied = context.pack["pillars/occupied_flat"]
+    occupied = context.file["pillars/occupied_flat"]
     for tag, mode in (("pillars", drawing.EVAL), ("pillars_trainmode", norm.Mode(train=True))):
         canvas, _ = net.apply(variables, points, count, mode, mutable=["batch_stats"])
         flat = np.asarray(canvas).reshape(-1, canvas.shape[-1])
@@ -83,9 +108,9 @@ def point_pillars(context: cases.Context) -> Checks:
             yield cases.Check(f"{tag}/occupied_flat", np.flatnonzero(flat.any(axis=1)), SHARE_TOLERANCE, _cells_apart)
 
 
-def _cells_apart(pack: packs.Pack, entry: str, got: np.ndarray) -> float:
+def _cells_apart(file: golden.File, entry: str, got: np.ndarray) -> float:
     """Share of the pillars that only one of the two sides has."""
-    return len(np.setxor1d(pack[entry], got)) / len(pack[entry])
+    return len(np.setxor1d(file[entry], got)) / len(file[entry])
 
 
 GROUPS: tuple[cases.Group, ...] = (frusta, point_pillars)

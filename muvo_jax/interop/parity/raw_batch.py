@@ -1,4 +1,7 @@
-"""The raw batch of packs p4 and p5 (what the authors' dataset gives), and the same as our model reads it."""
+"""The raw batch of golden files p4 and p5 (what the authors' dataset gives), and the same as our model reads it.
+
+Sizes are those of the arrays that a file stores of it, or else those of p4 in pack.json.
+"""
 
 from __future__ import annotations
 
@@ -10,30 +13,39 @@ from muvo_jax.interop import reference_preprocess as preprocess
 from muvo_jax.interop.parity import cases
 from muvo_jax.types import Batch
 
-IMAGE_SIZE, ROUTE_SIZE, RANGE_SIZE, VOXEL_SHAPE = (600, 960), (192, 192), (64, 1024), (192, 192, 64)
-POINTS, FEWER_POINTS = 60_000, 7_000
-
 
 def draw_raw(context: cases.Context, frames: int, later: int) -> dict[str, np.ndarray]:
     """Arrays [1, frames, ...] in torch's layout; the actions have `later` more, to imagine with."""
-    draw = context.draw
-    intrinsics = np.broadcast_to(preprocess.intrinsics(IMAGE_SIZE), (1, frames, 3, 3)).astype(np.float32)
+    draw, image_size = context.draw, context.size("p4", "image_hw")
+    intrinsics = np.broadcast_to(preprocess.intrinsics(image_size), (1, frames, 3, 3)).astype(np.float32)
     return {
-        "image": draw("full_image", (1, frames, 3, *IMAGE_SIZE), "image_u8"),
-        "route_map": draw("full_route", (1, frames, 3, *ROUTE_SIZE), "route_u8"),
+        "image": draw("full_image", (1, frames, 3, *image_size), "image_u8"),
+        "route_map": draw("full_route", (1, frames, 3, *context.size("p4", "route_hw")), "route_u8"),
         "speed": draw("full_speed", (1, frames, 1), "speed"),
-        "range_view_pcd_xyzd": draw("full_rv", (1, frames, 4, *RANGE_SIZE), "range_view"),
-        "voxel": draw("full_voxel", (1, frames, 1, *VOXEL_SHAPE), "voxel2"),
+        "range_view_pcd_xyzd": draw("full_rv", (1, frames, 4, *range_size(context)), "range_view"),
+        "voxel": draw("full_voxel", (1, frames, 1, *voxel_shape(context)), "voxel2"),
         "action": np.concatenate([draw("full_throttle", (1, frames + later, 1), "pm1"),
                                   draw("full_steer", (1, frames + later, 1), "pm1")], axis=-1),
         "intrinsics": intrinsics,
     }
 
 
+def range_size(context: cases.Context) -> tuple[int, ...]:
+    """Rows and columns of the range view."""
+    return (context.shape("in/range_view_pcd_xyzd") or context.size("p4", "range_hw"))[-2:]
+
+
+def voxel_shape(context: cases.Context) -> tuple[int, ...]:
+    """Sides of the voxel grid."""
+    smallest = context.shape("in/voxel_label_4")
+    return tuple(4 * side for side in smallest[-3:]) if smallest else context.size("p4", "voxel_xyz")
+
+
 def points(context: cases.Context, frames: int) -> dict[str, np.ndarray]:
     """The scans as points, for the PP variants: fields of our batch. Each frame counts fewer points than the last."""
-    clouds = [context.draw(f"full_cloud_{frame}", (POINTS,), "cloud") for frame in range(frames)]
-    count = POINTS - FEWER_POINTS * np.arange(frames, dtype=np.int32)
+    most = context.size("p4", "points")
+    clouds = [context.draw(f"full_cloud_{frame}", (most,), "cloud") for frame in range(frames)]
+    count = most - context.size("p4", "fewer_points") * np.arange(frames, dtype=np.int32)
     return {"points": np.stack(clouds)[None].astype(np.float32), "point_count": count[None]}
 
 

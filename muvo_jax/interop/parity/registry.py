@@ -1,13 +1,13 @@
-"""All packs that can be checked, in the order in which they run."""
+"""All kinds of golden files that can be checked, in the order in which they run."""
 
 from __future__ import annotations
 
-from muvo_jax.interop import packs
 from muvo_jax.interop.parity import (
     all_losses,
     cases,
     full_models,
     geometry,
+    golden,
     losses,
     modules_1d,
     modules_2d,
@@ -16,17 +16,17 @@ from muvo_jax.interop.parity import (
 )
 
 _BACKBONES = "mobilevitv2_100_backbones"
-_FULL_MODELS = tuple(rf"{name}\.npz" for name in packs.manifest_names() if name != _BACKBONES)
+_FULL_MODELS = tuple(rf"{name}\.npz" for name in golden.manifest_names() if name != _BACKBONES)
 
-PACKS = (
-    cases.PackChecks("p1", (r"p1_losses_metrics\.npz",), losses.GROUPS),
-    cases.PackChecks("p2", (r"p2_geometry\.npz",), geometry.GROUPS, geometry.LEFT_OUT),
-    cases.PackChecks("p3_1d", (r"p3_modules_1d\.npz",), modules_1d.GROUPS),
-    cases.PackChecks("p3_2d", (r"p3_modules_2d\.npz",), modules_2d.GROUPS),
-    cases.PackChecks("p4", _FULL_MODELS, full_models.GROUPS),
-    cases.PackChecks("p4_backbone", (r"mobilevitv2_100_backbone\.npz",), full_models.BACKBONE_GROUPS),
-    cases.PackChecks("p5_losses", (r"p5_losses_all_[12]d\.npz",), all_losses.GROUPS),
-    cases.PackChecks("p5_schedules", (r"p5_schedules\.npz",), (train_step.schedules,)),
-    cases.PackChecks("p5_step", (r"p5_train_step_[12]d\.npz",), train_step.GROUPS),
-    cases.PackChecks("p6", (r"p6_\w+\.npz",), p6.GROUPS, needs_recordings=True),
+FILES = (
+    cases.FileChecks("p1", (r"p1_losses_metrics\.npz",), losses.GROUPS),
+    cases.FileChecks("p2", (r"p2_geometry\.npz",), geometry.GROUPS, geometry.LEFT_OUT),
+    cases.FileChecks("p3_1d", (r"p3_modules_1d\.npz",), modules_1d.GROUPS),
+    cases.FileChecks("p3_2d", (r"p3_modules_2d\.npz",), modules_2d.GROUPS),
+    cases.FileChecks("p4", _FULL_MODELS, full_models.GROUPS),
+    cases.FileChecks("p4_backbone", (r"mobilevitv2_100_backbone\.npz",), full_models.BACKBONE_GROUPS),
+    cases.FileChecks("p5_losses", (r"p5_losses_all_[12]d\.npz",), all_losses.GROUPS),
+    cases.FileChecks("p5_schedules", (r"p5_schedules\.npz",), (train_step.schedules,)),
+    cases.FileChecks("p5_step", (r"p5_train_step_[12]d\.npz",), train_step.GROUPS),
+    cases.FileChecks("p6", (r"p6_\w+\.npz",), p6.GROUPS, needs_recordings=True),
 )

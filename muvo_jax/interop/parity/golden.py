@@ -1,4 +1,4 @@
-"""Packs of reference numbers: one npz file each, and pack.json, which holds the seed and the sizes of a folder.
+"""Golden files, the reference's numbers: npz files, and pack.json, which holds the seed and the sizes of a folder.
 
 An entry is stored whole under its name, or, where it is large, as `name::sub` (every n-th value of the flattened
 array), `name::meta` ([n, *shape]) and `name::stats` (mean, std, minimum, maximum, L2 norm of all values). Nothing in a
@@ -12,6 +12,7 @@ import json
 import os
 import pathlib
 import zipfile
+import zlib
 from collections.abc import Mapping
 from typing import Any
 
@@ -22,15 +23,15 @@ from muvo_jax.interop import weights_rule
 FORMAT = 1
 
 
-class PackError(ValueError):
-    """A pack or its pack.json cannot be read; the message names the file and what is wrong."""
+class GoldenError(ValueError):
+    """A golden file or its pack.json cannot be read; the message names the file and what is wrong."""
 
 
-class Pack:
+class File:
     """One file of reference numbers.
 
     Raises:
-      PackError: where the file is no npz file of plain arrays.
+      GoldenError: where the file is no npz file of plain arrays.
     """
 
     def __init__(self, path: str | os.PathLike):
@@ -38,8 +39,8 @@ class Pack:
         try:
             with np.load(self.path, allow_pickle=False) as stored:
                 self.arrays = {name: stored[name] for name in stored.files}
-        except (OSError, ValueError, zipfile.BadZipFile) as error:
-            raise PackError(f"{self.path}: expected an npz file of plain arrays ({error}).") from error
+        except (OSError, ValueError, EOFError, zlib.error, zipfile.BadZipFile) as error:
+            raise GoldenError(f"{self.path}: expected an npz file of plain arrays ({error}).") from error
         self.names = sorted({name.split("::")[0] for name in self.arrays})
 
     def __contains__(self, name: str) -> bool:
@@ -107,10 +108,10 @@ class Pack:
 
 
 class Settings:
-    """The seed and the sizes of a folder of packs; what pack.json leaves out is as in the packs of seed 0.
+    """The seed and the sizes of a folder of golden files; what pack.json leaves out is as with seed 0.
 
     Raises:
-      PackError: where pack.json is unreadable or of another format.
+      GoldenError: where pack.json is unreadable or of another format.
     """
 
     def __init__(self, folder: str | os.PathLike | None = None):
@@ -125,10 +126,10 @@ class Settings:
         try:
             stored = json.loads(path.read_text())
         except (OSError, ValueError) as error:
-            raise PackError(f"{path}: expected the JSON description of a folder of packs ({error}).") from error
+            raise GoldenError(f"{path}: expected the JSON description of golden files ({error}).") from error
         if not isinstance(stored, dict) or stored.get("format") != FORMAT:
             found = stored.get("format") if isinstance(stored, dict) else stored
-            raise PackError(f"{path}: expected format {FORMAT}, found {found!r}.")
+            raise GoldenError(f"{path}: expected format {FORMAT}, found {found!r}.")
         return stored
 
     def size(self, *path: str) -> Any:
@@ -146,7 +147,7 @@ class Settings:
         raise KeyError("/".join(path))
 
     def draw(self, name: str, shape: tuple[int, ...], kind: str) -> np.ndarray:
-        """An input of these packs, see weights_rule.make_input."""
+        """An input of these golden files, see weights_rule.make_input."""
         return weights_rule.make_input(name, shape, kind, self.seed)
 
 
@@ -170,7 +171,7 @@ def _data() -> pathlib.Path:
 
 @functools.cache
 def _default_sizes() -> dict[str, Any]:
-    return json.loads((_data() / "parity" / "default_sizes.json").read_text())
+    return json.loads((_data() / "default_sizes.json").read_text())
 
 
 def _as_tuple(node: Any) -> Any:

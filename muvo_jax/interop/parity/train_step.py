@@ -125,8 +125,8 @@ def _actions(predictions: types.Predictions, batch: types.Batch, loss: config_li
     """The predicted actions and their loss terms, numbers that may be near zero; `moved` gives their roundings."""
     for column, entry in enumerate(("throttle_brake", "steering")):
         pick = lambda action, column=column: jnp.asarray(action)[..., column:column + 1]
-        predicted = lambda predictions, pick=pick: pick(predictions["action"][1])
-        term = lambda predictions, pick=pick: loss.action * regression.l1_sums(pick(predictions["action"][1]),
+        predicted = lambda predictions, pick=pick: pick(predictions.action)
+        term = lambda predictions, pick=pick: loss.action * regression.l1_sums(pick(predictions.action),
                                                                                pick(batch.action)).value()
         for kind, value in (("out", predicted), ("loss", term)):
             roundings = lambda value=value: (value(predictions) for predictions in moved())
@@ -147,7 +147,7 @@ def _outputs(observed: types.Observed, predictions: types.Predictions, config: c
     for kind, gaussian in (("prior", observed.prior), ("posterior", observed.posterior)):
         for entry, value in (("mu", gaussian.mean), ("sigma", gaussian.std)):
             yield cases.Check(f"out/{kind}/{entry}", full_models.latent_layout(value), LOSS_TOLERANCE)
-    maps = {head: scales for head, scales in predictions.items() if head != "action"}
+    maps = {head: scales for head, scales in predictions.arrays.items() if head != "action"}
     for entry, value in full_models.prediction_entries("out", maps, config):
         yield cases.Check(entry, value, STYLED_TOLERANCE if "voxel" in entry else LOSS_TOLERANCE)
 

@@ -194,7 +194,7 @@ def moved_views(town: simulator.Town, config: config_lib.Config, states: Sequenc
     count, truths = len(states), [town_truth(town, state) for state in states]
     now = lambda head: np.stack([truth[head] for truth in truths])[:, None]
     calibration = {name: np.stack([getattr(town.renderer, name)] * count) for name in ("intrinsics", "camera_to_ego")}
-    held = np.broadcast_to(np.float32(action), (count, 1 + steps, 2))
+    held = np.broadcast_to(np.asarray(action, np.float32), (count, 1 + steps, 2))
     batch = types.Batch(action=held, is_first=np.zeros(held.shape[:2], bool), speed_mps=now("ego_motion")[..., 3],
                         **{head: now(head) for head in protocol.HEADS}, **calibration)
     frames = warp.warp(batch, 1, steps, config)

@@ -30,7 +30,7 @@ _ALWAYS_THERE = frozenset({"image", "range_view", "occupancy", "action"})
 _MADE_OF = {"ego_motion": frozenset({"pose", "speed_mps"}), "range_view_classes": frozenset({"point_classes"}),
             "depth_m": frozenset({"depth_m"}), "image_classes": frozenset({"image_classes"}),
             "image_instance_mask": frozenset({"image_instance_mask"})}
-_JUDGED = frozenset({"speed_mps", "ego_motion", "image_moving_mask", "occupancy_moving_mask"})
+_JUDGED = frozenset({"ego_motion", "image_moving_mask", "occupancy_moving_mask"})
 DEPTH_LIMIT_M = 100.0  # what is farther counts as nothing
 UNLABELLED = 255
 NAVIGATION = ("command", "next_command", "target_m", "next_target_m")
@@ -111,8 +111,7 @@ def prepare_frame(raw: schema.RawFrame, config: config_lib.Config) -> PreparedFr
 
 def judged_only(config: config_lib.Config) -> frozenset[str]:
     """The fields of a prepared frame that scores read and training does not, as far as a recording has them."""
-    trained = {"speed_mps"} if config.model.speed else set()
-    return _JUDGED - trained - config.targets.keys()
+    return _JUDGED - config.targets.keys()
 
 
 def _moving(raw: schema.RawFrame, ready: PreparedFrame, config: config_lib.Config) -> PreparedFrame:

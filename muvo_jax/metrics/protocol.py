@@ -205,7 +205,8 @@ class _Judge:
     def _baselines(self, truth: types.Batch, count: int,
                    moved: Mapping[str, baselines.Frames]) -> dict[str, dict[str, baselines.Frames]]:
         """Phase -> source -> frames [B, steps, ...]."""
-        data, guesses = self._config.data, {phase: {} for phase in PHASES}
+        data = self._config.data
+        guesses: dict[str, dict[str, baselines.Frames]] = {phase: {} for phase in PHASES}
         if "copy_last" in self._sources:
             guesses["imagined"]["copy_last"], unknown = baselines.copy_last(truth, data.context, data.horizon)
             self._unknown += unknown

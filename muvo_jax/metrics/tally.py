@@ -60,7 +60,8 @@ class Tally:
 
         NaN where nothing was defined; see streaming.summary.
         """
-        seed, result = self._evaluation.seed, {}
+        seed = self._evaluation.seed
+        result: dict[str, dict[str, Any]] = {}
         for name, sums in self._sums.items():
             if name in _VOXEL_SCORES:
                 result |= {f"{score}_{name}": streaming.summary(sums, occupancy.SCORES[score], seed)

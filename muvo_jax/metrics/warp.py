@@ -76,7 +76,7 @@ def _warp(batch, context, horizon, source, fused, geometry, grid, contract, stri
                 range_m = reproject.fill_holes(moved[..., 3], reproject.move_sky(seen, pose, geometry), geometry)
                 found["image"] = reproject.move_image(
                     repeat(batch.image[:, frame]).astype(jnp.float32) / 255.0, range_m, pose,
-                    *(repeat(jnp.asarray(value)) for value in (batch.intrinsics, batch.camera_to_ego)), geometry)
+                    repeat(jnp.asarray(batch.intrinsics)), repeat(jnp.asarray(batch.camera_to_ego)), geometry)
         for name, (values, known) in found.items():
             frames[name] = jnp.where(missing[name][..., None] & known[..., None], values, frames[name]) if (
                 name in frames) else values
@@ -103,7 +103,7 @@ def _driven_poses(batch: types.Batch, context: int, contract: config_lib.ActionC
     poses = [state.pose]
     for frame in range(batch.frames - 1):
         if frame < context:
-            state = state.replace(speed_mps=speed_mps[:, frame])
+            state = types.Motion(state.pose, speed_mps[:, frame])
         state = motion.drive(state, action[:, frame], contract, stride)
         poses.append(state.pose)
     return jnp.stack(poses, axis=1)

@@ -210,13 +210,6 @@ def test_beside_every_window_stands_one_of_another_drive():
     assert alone == entries[0].windows[1::-1]  # of one drive only: another window of it
 
 
-def test_what_scores_alone_read_is_kept_from_training():
-    frames = frames_of()
-    frames.config = dataclasses.replace(frames.config, model=dataclasses.replace(frames.config.model, speed=False))
-    entry = next(pipeline.evaluation_batches(frames, "val", windows=1, batch=1))
-    assert frames.batch(entry.windows).speed_mps is None and entry.batch.speed_mps is not None
-
-
 def test_evaluation_of_a_missing_split_fails_at_the_call():
     with pytest.raises(schema.DataError, match="no split 'val_ds'"):
         pipeline.evaluation_batches(frames_of(), "val_ds", windows=1)

@@ -171,7 +171,8 @@ def test_imagined_steps_are_driven_by_the_action_before_them(monkeypatch, config
     class Model:
         config = dataclasses.replace(presets.tiny().model, heads=("image",))
 
-        def decode(self, variables, features, heads):
+        def decode(self, variables, states, heads, memory):
+            features = states.features
             return types.Predictions({"image": {1: features[..., :3].reshape(*features.shape[:-1], 1, 1, 3)}})
 
     def observe(model, variables, key, batch, *, sampled):

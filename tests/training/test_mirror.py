@@ -12,16 +12,17 @@ from hypothesis import strategies as st
 
 from muvo_jax import config as config_lib
 from muvo_jax import presets, types
-from muvo_jax.agents import kinematics
 from muvo_jax.data import ego_motion
 from muvo_jax.data.town import renderer
+from muvo_jax.ops import motion as motion_ops
 from muvo_jax.ops import range_view, voxels
 from muvo_jax.training import mirror
 from muvo_jax.training import step as step_lib
 
 OTHER_SIDE = np.array([1.0, -1.0, 1.0], np.float32)
-SHAPES = {"image": (8, 12, 3), "range_view": (4, 8, 4), "points": (5, 3), "occupancy": (4, 6, 2), "route_map": (64, 64),
-          "depth_m": (8, 12), "image_classes": (8, 12), "image_instance_mask": (8, 12), "range_view_classes": (4, 8),
+SHAPES = {"image": (8, 12, 3), "range_view": (4, 8, 4), "points": (5, 3), "occupancy": (4, 6, 2),
+          "occupancy_moving_mask": (4, 6, 2), "route_map": (64, 64), "depth_m": (8, 12), "image_classes": (8, 12),
+          "image_instance_mask": (8, 12), "image_moving_mask": (8, 12), "range_view_classes": (4, 8),
           "birds_eye_classes": (4, 6), "birds_eye_instances": (4, 6), "action": (2,), "target_m": (2,),
           "next_target_m": (2,), "ego_motion": (4,)}
 
@@ -112,9 +113,9 @@ def test_the_mirrored_way_is_drawn_where_the_flip_puts_it():
 def test_mirrored_actions_drive_the_mirrored_path(seed, speed_mps):
     actions = np.random.default_rng(seed).uniform(-1.0, 1.0, (1, 6, 2)).astype(np.float32)
     other = mirror.mirrored(types.Batch(action=actions, is_first=np.zeros((1, 6), bool))).action
-    start, contract = kinematics.at_rest_of_frame(jnp.float32(speed_mps)), config_lib.ActionContract()
-    own_path = kinematics.path(start, jnp.asarray(actions[0]), contract, periods=2)
-    other_path = kinematics.path(start, other[0], contract, periods=2)
+    start, contract = motion_ops.at_rest_of_frame(jnp.float32(speed_mps)), config_lib.ActionContract()
+    own_path = motion_ops.path(start, jnp.asarray(actions[0]), contract, periods=2)
+    other_path = motion_ops.path(start, other[0], contract, periods=2)
     np.testing.assert_allclose(other_path.pose, np.asarray(own_path.pose) * [[1.0, -1.0, -1.0]], atol=1e-5)
     np.testing.assert_allclose(other_path.speed_mps, own_path.speed_mps)
     # and it is the motion that a recording of that path would have

@@ -147,7 +147,7 @@ def _outputs(observed: types.Observed, predictions: types.Predictions, config: c
     for kind, gaussian in (("prior", observed.prior), ("posterior", observed.posterior)):
         for entry, value in (("mu", gaussian.mean), ("sigma", gaussian.std)):
             yield cases.Check(f"out/{kind}/{entry}", full_models.latent_layout(value), LOSS_TOLERANCE)
-    maps = {head: scales for head, scales in predictions.arrays.items() if head != "action"}
+    maps = types.Predictions({head: scales for head, scales in predictions.arrays.items() if head != "action"})
     for entry, value in full_models.prediction_entries("out", maps, config):
         yield cases.Check(entry, value, STYLED_TOLERANCE if "voxel" in entry else LOSS_TOLERANCE)
 

@@ -81,7 +81,7 @@ class Transition(linen.Module, abc.ABC):
         """The zero state, [batch_size, ...], before anything was seen."""
         return LatentState(*(jnp.zeros((batch_size, *shape), jnp.float32) for shape in cls.state_shapes(config)))
 
-    def observe_step(self, noise: StepNoise, action: jax.Array, state: LatentState, embedding: jax.Array,
+    def observe_step(self, noise: StepNoise, state: LatentState, action: jax.Array, embedding: jax.Array,
                      is_first: jax.Array) -> tuple[LatentState, tuple[Gaussian, Gaussian]]:
         """One step with an observation; see WorldModel.observe_step."""
         state = jax.tree.map(lambda leaf: where(is_first, jnp.zeros_like(leaf), leaf), state)
@@ -92,7 +92,7 @@ class Transition(linen.Module, abc.ABC):
         stochastic = where(noise.use_prior & ~is_first, prior.sample(noise.prior), posterior.sample(noise.posterior))
         return LatentState(deterministic, stochastic), (prior, posterior)
 
-    def imagine_step(self, noise: jax.Array, action: jax.Array, state: LatentState) -> tuple[LatentState, Gaussian]:
+    def imagine_step(self, noise: jax.Array, state: LatentState, action: jax.Array) -> tuple[LatentState, Gaussian]:
         """One step without an observation; see WorldModel.imagine_step."""
         deterministic = self.recur(state)
         prior = self.predict(deterministic, action, None)

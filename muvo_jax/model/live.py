@@ -77,6 +77,6 @@ def _observe_step(model, variables, live, batch, sampled):
     noise = jax.vmap(lambda key: rollout.frame_noise(key, shape))(keys)
     if not sampled:
         noise = rollout.mean_mode(noise)
-    latent, _ = model.observe_step(variables, noise, batch.action[:, 0], live.latent, embedding[:, 0],
+    latent, _ = model.observe_step(variables, noise, live.latent, batch.action[:, 0], embedding[:, 0],
                                    batch.is_first[:, 0])
     return LiveState(latent, live.keys, live.frame + 1)

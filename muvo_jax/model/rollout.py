@@ -74,7 +74,7 @@ def filter_embeddings(model: WorldModel, variables: Variables, embedding: jax.Ar
 
     def step(state, inputs):
         noise_t, action_t, embedding_t, is_first_t = inputs
-        state, (prior, posterior) = model.observe_step(variables, noise_t, action_t, state, embedding_t, is_first_t)
+        state, (prior, posterior) = model.observe_step(variables, noise_t, state, action_t, embedding_t, is_first_t)
         return state, (state.deterministic, prior, posterior)
 
     inputs = jax.tree.map(_swap_time, (noise, previous, embedding, is_first))
@@ -262,7 +262,7 @@ def _advance(model, variables, keys, state, action, temperature):
     if temperature is not None:
         shape = state.stochastic.shape[1:]
         noise = temperature * jax.vmap(lambda key: jax.random.normal(key, shape))(keys)
-    return model.imagine_step(variables, noise, action, state)
+    return model.imagine_step(variables, noise, state, action)
 
 
 def _imagine_flat(model, variables, keys_noise, keys_policy, state, driver, *, temperature, horizon):

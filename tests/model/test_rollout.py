@@ -91,7 +91,7 @@ def test_imagine_equals_a_loop_by_hand(variables, state, actions):
     np.testing.assert_array_equal(dream.actions, actions)
     current = state
     for step in range(HORIZON):
-        current, prior = MODEL.imagine_step(variables, jnp.zeros_like(state.stochastic), actions[:, step], current)
+        current, prior = MODEL.imagine_step(variables, jnp.zeros_like(state.stochastic), current, actions[:, step])
         assert_close((dream.states[:, step], dream.prior[:, step]), (current, prior))
 
 

@@ -126,13 +126,23 @@ def _value(config, critic, observation):
 
 
 def policy(config: ActorCriticConfig, actor: Any, *, sampled: bool = True) -> jax.tree_util.Partial:
-    """The actor as policy(key, observation) -> action for `environment.play`; its mode unless sampled."""
-    return jax.tree_util.Partial(functools.partial(_act, config, sampled), actor)
+    """The actor as policy(key, observation) -> action for `environment.play`; its mode unless sampled.
+
+    Policies of one config are one function with other weights: none compiles anew.
+    """
+    return jax.tree_util.Partial(_Act(config, sampled), actor)
 
 
-def _act(config, sampled, actor, key, observation):
-    mean, std = _moments(config, actor, observation)
-    return jnp.tanh(mean + std * jax.random.normal(key, mean.shape) if sampled else mean)
+@dataclasses.dataclass(frozen=True)
+class _Act:
+    """Compares by its fields, as a closure or functools.partial would not."""
+
+    config: ActorCriticConfig
+    sampled: bool
+
+    def __call__(self, actor, key, observation):
+        mean, std = _moments(self.config, actor, observation)
+        return jnp.tanh(mean + std * jax.random.normal(key, mean.shape) if self.sampled else mean)
 
 
 def init(key: Array, environment: environment_lib.Environment, config: ActorCriticConfig) -> Learner:

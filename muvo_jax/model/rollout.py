@@ -6,6 +6,7 @@ on the number of devices.
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 import math
 from collections.abc import Callable, Sequence
@@ -202,13 +203,22 @@ def decode(model: WorldModel, variables: Variables, states: LatentState | Dream 
 
 
 def learned_policy(model: WorldModel, variables: Variables) -> Policy:
-    """The model's own action head as a policy for `imagine`: the driver of the training data, cloned."""
-    return jax.tree_util.Partial(functools.partial(_decode_action, model), variables)
+    """The model's own action head as a policy for `imagine`: the driver of the training data, cloned.
+
+    Policies of one model are one function with other variables: none compiles anew.
+    """
+    return jax.tree_util.Partial(_ActionHead(model), variables)
 
 
-def _decode_action(model, variables, key, features):
-    del key
-    return model.decode(variables, features, ("action",)).action
+@dataclasses.dataclass(frozen=True)
+class _ActionHead:
+    """Compares by its model, as a closure or functools.partial would not."""
+
+    model: WorldModel
+
+    def __call__(self, variables, key, features):
+        del key
+        return self.model.decode(variables, features, ("action",)).action
 
 
 def _keys_of(key, lead):

@@ -149,6 +149,17 @@ def test_the_learned_policy_is_the_action_head(variables, state):
                                atol=1e-6)
 
 
+def test_the_learned_policy_compiles_once_whatever_its_weights(variables, state):
+    drive = lambda weights: rollout.imagine(MODEL, variables, jax.random.key(2), state,
+                                            rollout.learned_policy(MODEL, weights), horizon=2)
+    first = drive(variables)
+    before = rollout._imagine._cache_size()
+    drive(variables)
+    other = drive(jax.tree.map(lambda leaf: 2 * leaf, variables))
+    assert rollout._imagine._cache_size() == before
+    assert not np.allclose(first.actions, other.actions)
+
+
 def test_gradients_reach_actions_and_the_start_state(variables, state, actions):
     def target(actions, state):
         dream = rollout.imagine(MODEL, variables, jax.random.key(3), state, actions)

@@ -51,7 +51,8 @@ def observe_step(model: WorldModel, variables: Variables, live: LiveState, obser
       live: from start_live or the call before.
       observation: field of Batch -> array [B, ...] without time axis, in the units of Batch: "image", "range_view",
         "route_map", "speed_mps", whatever the model reads.
-      previous_action: float32 [B, 2], applied between the last observation and this one; unused at the first.
+      previous_action: float32 [B, 2], applied between the last observation and this one, unused at the first; values
+        that lie on a device are clipped to [-1, 1], not looked at.
       sampled: sample the latents; otherwise take their means.
 
     Returns:

@@ -177,7 +177,7 @@ def imagine_step(model: WorldModel, variables: Variables, key: jax.Array, state:
       model, variables: the model.
       key: typed key, of which state i of all takes fold_in(key, i), or one per state [*L], taken as it is.
       state: LatentState [*L, ...] with any leading axes.
-      action: [*L, 2] in [-1, 1], applied at `state`.
+      action: [*L, 2] in [-1, 1], applied at `state`; values that lie on a device are clipped, not looked at.
       sampled, temperature: as in `imagine`.
 
     Returns:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from muvo_jax import presets
-from muvo_jax.model import rollout, world_model
+from muvo_jax.model import checks, rollout, world_model
 from muvo_jax.types import Batch, LatentState
 
 CONFIG = presets.get("tiny").model
@@ -121,7 +121,14 @@ def test_imagine_step_takes_any_leading_axes_and_compiles_once(variables, state,
     with pytest.raises(ValueError, match=r"imagine_step: got action \[2\], expected \[2, 2\]"):
         step(jax.random.key(1), state, actions[0, 0])
     with pytest.raises(ValueError, match="reach from 3 to 3"):
-        step(jax.random.key(1), state, jnp.full((BATCH, 2), 3.0))
+        step(jax.random.key(1), state, np.full((BATCH, 2), 3.0))
+
+
+def test_actions_on_a_device_are_clipped_there_and_never_looked_at(variables, state, monkeypatch):
+    step = lambda action: rollout.imagine_step(MODEL, variables, jax.random.key(1), state, action)
+    largest = step(np.ones((BATCH, 2), np.float32))
+    monkeypatch.setattr(checks, "action_values", lambda *_: pytest.fail("the host waited for the device"))
+    assert_close(step(jnp.full((BATCH, 2), 3.0)), largest)
 
 
 def test_branches_are_independent_futures(variables, state, actions):

@@ -19,6 +19,7 @@ import optax
 from flax import linen
 
 from muvo_jax.agents import environment as environment_lib
+from muvo_jax.ops import precision
 from muvo_jax.types import Array
 
 
@@ -67,8 +68,8 @@ class Perceptron(linen.Module):
     @linen.compact
     def __call__(self, x: Array) -> Array:
         for _ in range(self.layers):
-            x = linen.silu(linen.RMSNorm()(linen.Dense(self.width)(x)))
-        return linen.Dense(self.outputs, kernel_init=linen.initializers.zeros)(x)
+            x = linen.silu(linen.RMSNorm()(linen.Dense(self.width, precision=precision.PRODUCTS)(x)))
+        return linen.Dense(self.outputs, kernel_init=linen.initializers.zeros, precision=precision.PRODUCTS)(x)
 
 
 def symlog(x: Array) -> Array:

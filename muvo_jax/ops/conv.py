@@ -21,7 +21,7 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
-from muvo_jax.ops import conv_cpu
+from muvo_jax.ops import conv_cpu, precision
 
 Implementation = Literal["auto", "xla", "gemm"]
 PerAxis = int | Sequence[int]
@@ -231,7 +231,8 @@ def _depthwise_forms(stride: int, padding: int) -> tuple[Form, Form]:
 
     def grouped(x, kernel):
         return lax.conv_general_dilated(x, kernel, (stride, stride), [(padding, padding)] * 2,
-                                        dimension_numbers=("NHWC", "HWIO", "NHWC"), feature_group_count=x.shape[-1])
+                                        dimension_numbers=("NHWC", "HWIO", "NHWC"), feature_group_count=x.shape[-1],
+                                        precision=precision.PRODUCTS)
 
     return shifted, grouped
 
@@ -240,7 +241,7 @@ def _pointwise(x, kernel, strides, pairs):
     """A kernel of one tap is a matrix product."""
     x = jnp.pad(x, ((0, 0), *pairs, (0, 0)))
     x = x[(slice(None), *(slice(None, None, step) for step in strides))]
-    return lax.dot_general(x, kernel.reshape(kernel.shape[-2:]), (((x.ndim - 1,), (0,)), ((), ())))
+    return jnp.dot(x, kernel.reshape(kernel.shape[-2:]), precision=precision.PRODUCTS)
 
 
 def _cpu_conv(x, kernel, strides, pairs):
@@ -257,7 +258,8 @@ def _dilated(x, kernel, strides, pads, outs):
                   for n, k, s, p, o in zip(x.shape[1:-1], taps, strides, pads, outs, strict=True))
     space = "XYZ"[:rank]
     return lax.conv_general_dilated(x, jnp.flip(kernel, tuple(range(rank))), (1,) * rank, edges, lhs_dilation=strides,
-                                    dimension_numbers=(f"N{space}C", f"{space}IO", f"N{space}C"))
+                                    dimension_numbers=(f"N{space}C", f"{space}IO", f"N{space}C"),
+                                    precision=precision.PRODUCTS)
 
 
 def _from_one_pixel(x, kernel, pads, outs):
@@ -266,7 +268,7 @@ def _from_one_pixel(x, kernel, pads, outs):
     rank = len(taps)
     pixel = x.reshape(x.shape[0], channels_in)
     weights = jnp.moveaxis(kernel, -2, 0).reshape(channels_in, -1)
-    painted = (pixel @ weights).reshape(x.shape[0], *taps, channels_out)
+    painted = jnp.dot(pixel, weights, precision=precision.PRODUCTS).reshape(x.shape[0], *taps, channels_out)
     edges = [(-p, o + p - k, 0) for p, o, k in zip(pads, outs, taps, strict=True)]
     return lax.pad(painted, jnp.zeros((), painted.dtype), ((0, 0, 0), *edges[:rank], (0, 0, 0)))
 

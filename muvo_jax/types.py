@@ -332,7 +332,7 @@ class Predictions:
         found = sorted({found for scales in self.arrays.values() for found in scales})
         if scale not in found:
             raise ValueError(f"no decoded head has the scale {scale}; there are {', '.join(map(str, found))}.")
-        return self.replace(scale=scale)  # type: ignore[attr-defined]
+        return dataclasses.replace(self, scale=scale)
 
     def __getitem__(self, head: str) -> Array:
         if not isinstance(head, str):
@@ -359,4 +359,4 @@ class Predictions:
 
     def __or__(self, other: Predictions) -> Predictions:
         """The heads of both."""
-        return self.replace(arrays={**self.arrays, **other.arrays})  # type: ignore[attr-defined]
+        return dataclasses.replace(self, arrays={**self.arrays, **other.arrays})

@@ -45,7 +45,6 @@ def test_paper_presets_have_the_papers_lengths_and_heads():
     assert "occupancy" in occupancy.model.heads and "occupancy" not in paper.model.heads
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("variant", [*_VARIANTS, *({**_VARIANTS[0], "fusion": "tr", "latent": "2d", "camera": camera}
                                                    for camera in config_lib.CAMERA_ENCODERS)])
 def test_the_town_preset_exists_for_every_variant_at_a_small_size(variant):

@@ -137,7 +137,7 @@ def posterior_memory() -> tuple[str, str]:
 
         def means(table, model=model, params=params, embedding=embedding, noise=noise):
             moved = {**params, "transition": {**params["transition"], "type_embedding": table}}
-            return model.observe_step({"params": moved}, noise, jnp.ones((4, 2)), model.initial_state(4), embedding,
+            return model.observe_step({"params": moved}, noise, model.initial_state(4), jnp.ones((4, 2)), embedding,
                                       jnp.zeros((4,), bool))[1][1].mean
 
         table = jnp.asarray(params["transition"]["type_embedding"])

@@ -19,6 +19,7 @@ import optax
 from flax import linen
 
 from muvo_jax.agents import environment as environment_lib
+from muvo_jax.ops import precision
 from muvo_jax.types import Array
 
 
@@ -67,8 +68,8 @@ class Perceptron(linen.Module):
     @linen.compact
     def __call__(self, x: Array) -> Array:
         for _ in range(self.layers):
-            x = linen.silu(linen.RMSNorm()(linen.Dense(self.width)(x)))
-        return linen.Dense(self.outputs, kernel_init=linen.initializers.zeros)(x)
+            x = linen.silu(linen.RMSNorm()(linen.Dense(self.width, precision=precision.PRODUCTS)(x)))
+        return linen.Dense(self.outputs, kernel_init=linen.initializers.zeros, precision=precision.PRODUCTS)(x)
 
 
 def symlog(x: Array) -> Array:
@@ -126,13 +127,23 @@ def _value(config, critic, observation):
 
 
 def policy(config: ActorCriticConfig, actor: Any, *, sampled: bool = True) -> jax.tree_util.Partial:
-    """The actor as policy(key, observation) -> action for `environment.play`; its mode unless sampled."""
-    return jax.tree_util.Partial(functools.partial(_act, config, sampled), actor)
+    """The actor as policy(key, observation) -> action for `environment.play`; its mode unless sampled.
+
+    Policies of one config are one function with other weights: none compiles anew.
+    """
+    return jax.tree_util.Partial(_Act(config, sampled), actor)
 
 
-def _act(config, sampled, actor, key, observation):
-    mean, std = _moments(config, actor, observation)
-    return jnp.tanh(mean + std * jax.random.normal(key, mean.shape) if sampled else mean)
+@dataclasses.dataclass(frozen=True)
+class _Act:
+    """Compares by its fields, as a closure or functools.partial would not."""
+
+    config: ActorCriticConfig
+    sampled: bool
+
+    def __call__(self, actor, key, observation):
+        mean, std = _moments(self.config, actor, observation)
+        return jnp.tanh(mean + std * jax.random.normal(key, mean.shape) if self.sampled else mean)
 
 
 def init(key: Array, environment: environment_lib.Environment, config: ActorCriticConfig) -> Learner:

@@ -245,7 +245,7 @@ class Environment:
         """One imagined step under action [2], clipped to [-1, 1]; see Transition. No auto-reset: `restart` does it."""
         action = self._checked(action)
         noise = params.temperature * jax.random.normal(key, state.latent.stochastic.shape)
-        batched = jax.tree.map(lambda leaf: jnp.expand_dims(leaf, 0), (noise, action, state.latent))
+        batched = jax.tree.map(lambda leaf: jnp.expand_dims(leaf, 0), (noise, state.latent, action))
         latent, _ = self.model.imagine_step(params.variables, *batched)
         latent = latent[0]
         full, for_reward = self._decode(params.variables, params.bank, latent, state.start)

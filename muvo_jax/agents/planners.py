@@ -15,6 +15,7 @@ import jax.numpy as jnp
 import optax
 
 from muvo_jax.agents import environment as environment_lib
+from muvo_jax.ops import precision
 from muvo_jax.types import Array
 
 Objective = Callable[[Array, Array], Array]
@@ -94,7 +95,7 @@ def mppi(objective: Objective, key: Array, start: Array, config: PlannerConfig =
         plans = jnp.clip(mean[None] + noise, -1.0, 1.0).at[0].set(mean)
         values = _finite(objective(key_value, plans))
         weights = jax.nn.softmax(values / config.temperature)
-        return jnp.einsum("p,pha->ha", weights, plans), None
+        return jnp.einsum("p,pha->ha", weights, plans, precision=precision.PRODUCTS), None
 
     mean, _ = jax.lax.scan(iterate, jnp.clip(start, -1.0, 1.0), jax.random.split(key, config.iterations))
     return Plan(mean, objective(jax.random.fold_in(key, config.iterations), mean[None])[0])

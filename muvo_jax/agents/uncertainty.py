@@ -21,7 +21,7 @@ class Reliability:
     Attributes:
       confidence: float32 [K], mean predicted probability in a bin; NaN where it is empty.
       frequency: float32 [K], share of its voxels that were occupied; NaN where it is empty.
-      count: float32 [K], voxels.
+      count: int32 [K], voxels.
     """
 
     confidence: Array
@@ -32,7 +32,8 @@ class Reliability:
     def calibration_error(self) -> Array:
         """Expected calibration error: the mean of |confidence - frequency|, weighted by count."""
         gap = jnp.where(self.count > 0, jnp.abs(self.confidence - self.frequency), 0.0)
-        return (gap * self.count).sum() / jnp.maximum(self.count.sum(), 1.0)
+        weight = self.count.astype(jnp.float32)
+        return (gap * weight).sum() / jnp.maximum(weight.sum(), 1.0)
 
 
 def branch_probability(logits: Array, axis: int = 1) -> Array:
@@ -49,12 +50,15 @@ def brier_score(probability: Array, occupancy: Array) -> Array:
 
 def reliability(probability: Array, occupancy: Array, bins: int = 10) -> Reliability:
     """How often voxels were occupied that were said to be so with a probability; unknown voxels are left out."""
-    known = (occupancy != OCCUPANCY_UNKNOWN).ravel().astype(jnp.float32)
-    occupied = (occupancy == OCCUPANCY_OCCUPIED).ravel().astype(jnp.float32)
-    index = jnp.clip((probability.ravel() * bins).astype(jnp.int32), 0, bins - 1)
-    add = lambda values: jnp.zeros(bins, jnp.float32).at[index].add(values * known)
-    count = add(jnp.ones_like(occupied))
-    return Reliability(add(probability.ravel()) / count, add(occupied) / count, count)
+    known, occupied = occupancy != OCCUPANCY_UNKNOWN, occupancy == OCCUPANCY_OCCUPIED
+    index = jnp.clip((probability * bins).astype(jnp.int32), 0, bins - 1)
+
+    def sums(number):  # one reduction for each bin: float32 bins that are added to one by one stop at 2^24
+        here = known & (index == number)
+        return jnp.where(here, probability, 0.0).sum(), (here & occupied).sum(), here.sum()
+
+    confidence, frequency, count = jax.lax.map(sums, jnp.arange(bins))
+    return Reliability(confidence / count, frequency / count, count)
 
 
 def crps(samples: Array, truth: Array, axis: int = 0) -> Array:

@@ -61,13 +61,19 @@ def actions(given, lead: tuple[int, ...], horizon: int | None, branches: int | N
 def one_action(given, lead: tuple[int, ...], where: str, name: str = "action") -> jax.Array:
     """Returns the action [*lead, 2] of one step as float32.
 
+    Values on the host (NumPy, lists) are looked at. Those on a device are clipped to [-1, 1] there instead: to look at
+    them the host would wait, at every step of a loop, for the device to catch up. Traced values pass.
+
     Raises:
-      ValueError: for another shape, or for concrete values that are not finite or outside [-1, 1].
+      ValueError: for another shape, or for values on the host that are not finite or outside [-1, 1].
     """
     expected = (*lead, ACTION_CHANNELS)
     if jnp.shape(given) != expected:
         raise ValueError(f"{where}: got {name} {list(jnp.shape(given))}, expected {list(expected)} (acceleration, "
                          f"steering).")
+    if isinstance(given, jax.Array):
+        on_device = given.astype(jnp.float32)
+        return on_device if isinstance(given, jax.core.Tracer) else jnp.clip(on_device, -1.0, 1.0)
     action_values(given, where)
     return jnp.asarray(given, jnp.float32)
 

@@ -89,7 +89,7 @@ class Transition(linen.Module, abc.ABC):
         return LatentState(*(jnp.zeros((batch_size, *shape), jnp.float32) for shape in cls.state_shapes(config)),
                            vantage)
 
-    def observe_step(self, noise: StepNoise, action: jax.Array, state: LatentState, embedding: jax.Array,
+    def observe_step(self, noise: StepNoise, state: LatentState, action: jax.Array, embedding: jax.Array,
                      is_first: jax.Array) -> tuple[LatentState, tuple[Gaussian, Gaussian]]:
         """One step with an observation; see WorldModel.observe_step. The vantage is left to whoever observed."""
         state = jax.tree.map(lambda leaf: where(is_first, jnp.zeros_like(leaf), leaf), state)
@@ -101,7 +101,7 @@ class Transition(linen.Module, abc.ABC):
         stochastic = where(noise.use_prior & ~is_first, prior.sample(noise.prior), posterior.sample(noise.posterior))
         return state.replace(deterministic=deterministic, stochastic=stochastic), (prior, posterior)
 
-    def imagine_step(self, noise: jax.Array, action: jax.Array, state: LatentState) -> tuple[LatentState, Gaussian]:
+    def imagine_step(self, noise: jax.Array, state: LatentState, action: jax.Array) -> tuple[LatentState, Gaussian]:
         """One step without an observation; see WorldModel.imagine_step."""
         effect, step = self.effect(action, state)
         deterministic = self.recur(state, effect)

@@ -56,7 +56,8 @@ def observe_step(model: WorldModel, variables: Variables, live: LiveState, obser
       observation: field of Batch -> array [B, ...] without time axis, in the units of Batch: "image", "range_view",
         "route_map", "speed_mps", whatever the model reads. A model that moves its memory without the bicycle takes
         "ego_motion" too where it is measured (odometry).
-      previous_action: float32 [B, 2], applied between the last observation and this one; unused at the first.
+      previous_action: float32 [B, 2], applied between the last observation and this one, unused at the first; values
+        that lie on a device are clipped to [-1, 1], not looked at.
       sampled: sample the latents; otherwise take their means.
 
     Returns:
@@ -82,7 +83,7 @@ def _observe_step(model, variables, live, batch, sampled):
     noise = jax.vmap(lambda key: rollout.frame_noise(key, shape))(keys)
     if not sampled:
         noise = rollout.mean_mode(noise)
-    latent, _ = model.observe_step(variables, noise, batch.action[:, 0], live.latent, embedding[:, 0],
+    latent, _ = model.observe_step(variables, noise, live.latent, batch.action[:, 0], embedding[:, 0],
                                    batch.is_first[:, 0])
     if not model.config.tracks_motion:
         return LiveState(latent, live.keys, live.frame + 1)

@@ -6,6 +6,7 @@ on the number of devices.
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 import math
 from collections.abc import Callable, Sequence
@@ -78,7 +79,7 @@ def filter_embeddings(model: WorldModel, variables: Variables, embedding: jax.Ar
 
     def step(state, inputs):
         noise_t, action_t, embedding_t, is_first_t, speed_t = inputs
-        state, (prior, posterior) = model.observe_step(variables, noise_t, action_t, state, embedding_t, is_first_t)
+        state, (prior, posterior) = model.observe_step(variables, noise_t, state, action_t, embedding_t, is_first_t)
         deterministic = state.deterministic
         if speed_t is not None:
             motion = state.vantage.motion.replace(speed_mps=speed_t)
@@ -191,7 +192,7 @@ def imagine_step(model: WorldModel, variables: Variables, key: jax.Array, state:
       model, variables: the model.
       key: typed key, of which state i of all takes fold_in(key, i), or one per state [*L], taken as it is.
       state: LatentState [*L, ...] with any leading axes.
-      action: [*L, 2] in [-1, 1], applied at `state`.
+      action: [*L, 2] in [-1, 1], applied at `state`; values that lie on a device are clipped, not looked at.
       sampled, temperature: as in `imagine`.
 
     Returns:
@@ -221,13 +222,22 @@ def decode(model: WorldModel, variables: Variables, states: LatentState | Dream 
 
 
 def learned_policy(model: WorldModel, variables: Variables) -> Policy:
-    """The model's own action head as a policy for `imagine`: the driver of the training data, cloned."""
-    return jax.tree_util.Partial(functools.partial(_decode_action, model), variables)
+    """The model's own action head as a policy for `imagine`: the driver of the training data, cloned.
+
+    Policies of one model are one function with other variables: none compiles anew.
+    """
+    return jax.tree_util.Partial(_ActionHead(model), variables)
 
 
-def _decode_action(model, variables, key, features):
-    del key
-    return model.decode(variables, features, ("action",)).action
+@dataclasses.dataclass(frozen=True)
+class _ActionHead:
+    """Compares by its model, as a closure or functools.partial would not."""
+
+    model: WorldModel
+
+    def __call__(self, variables, key, features):
+        del key
+        return self.model.decode(variables, features, ("action",)).action
 
 
 def _keys_of(key, lead):
@@ -281,7 +291,7 @@ def _advance(model, variables, keys, state, action, temperature):
     if temperature is not None:
         shape = state.stochastic.shape[1:]
         noise = temperature * jax.vmap(lambda key: jax.random.normal(key, shape))(keys)
-    return model.imagine_step(variables, noise, action, state)
+    return model.imagine_step(variables, noise, state, action)
 
 
 def _imagine_flat(model, variables, keys_noise, keys_policy, state, driver, *, temperature, horizon):

@@ -13,6 +13,7 @@ from flax import linen
 from muvo_jax.config import ModelConfig
 from muvo_jax.model import common, filtering, token_transition
 from muvo_jax.nn import layers
+from muvo_jax.ops import precision
 from muvo_jax.types import Gaussian, LatentState
 
 
@@ -31,7 +32,8 @@ class GRUCell(linen.Module):
         input_bias = self.param("input_bias", layers.shape_only, (size,))
         hidden_bias = self.param("hidden_bias", layers.shape_only, (size,))
         affine = lambda value, kernel, bias: jnp.dot(
-            value.astype(dtype), kernel.astype(dtype)).astype(jnp.float32) + layers.per_channel(bias, value.ndim)
+            value.astype(dtype), kernel.astype(dtype),
+            precision=precision.PRODUCTS).astype(jnp.float32) + layers.per_channel(bias, value.ndim)
         input_reset, input_update, input_new = jnp.split(affine(x, input_kernel, input_bias), 3, axis=-1)
         hidden_reset, hidden_update, hidden_new = jnp.split(affine(state, hidden_kernel, hidden_bias), 3, axis=-1)
         reset = jax.nn.sigmoid(input_reset + hidden_reset)

@@ -1,10 +1,13 @@
 """The world model: five pure functions over explicit variables, composed from the parts that the configuration names.
 
     encode        observations -> embedding per frame
-    observe_step  state, previous action, embedding -> next state (filtering)
-    imagine_step  state, action -> next state (prediction)
+    observe_step  noise, state, previous action, embedding -> next state (filtering)
+    imagine_step  noise, state, action -> next state (prediction)
     decode        latent features -> images, range views, occupancy, actions
     init          fresh variables
+
+This is the inner layer: its steps take the noise itself and are as deterministic as the rest. The functions of
+rollout.py and live.py, which muvo_jax names, take (model, variables, key, ...), draw the noise and check what comes in.
 """
 
 from __future__ import annotations
@@ -95,8 +98,8 @@ class Network(linen.Module):
     def observe_step(self, *args):
         return self.transition.observe_step(*args)
 
-    def imagine_step(self, noise: jax.Array, action: jax.Array, state: LatentState) -> tuple[LatentState, Gaussian]:
-        following, prior = self.transition.imagine_step(noise, action, state)
+    def imagine_step(self, noise: jax.Array, state: LatentState, action: jax.Array) -> tuple[LatentState, Gaussian]:
+        following, prior = self.transition.imagine_step(noise, state, action)
         if self.config.tracks_motion and self.config.kinematics is None:
             step = self.ego_motion(following.features)
             following = following.replace(vantage=memory_lib.moved_on(state.vantage, step))
@@ -132,7 +135,7 @@ class Network(linen.Module):
     def everything(self, frames: dict[str, jax.Array], noise: StepNoise, action: jax.Array, state: LatentState,
                    is_first: jax.Array) -> dict[str, dict[int, jax.Array]]:
         """Touches every parameter once; only its shapes are ever computed."""
-        state, _ = self.observe_step(noise, action, state, self.encode(frames, norm.Mode(), None), is_first)
+        state, _ = self.observe_step(noise, state, action, self.encode(frames, norm.Mode(), None), is_first)
         memory = memory_lib.empty(self.config, 1)
         return self.decode(state.features, state.vantage, memory, jnp.zeros((1,), jnp.int32), self.config.heads)
 
@@ -225,15 +228,15 @@ class WorldModel:
         """The zero state [batch_size, ...], before anything was seen."""
         return transition.REGISTRY[self.config.latent].initial_state(self.config, batch_size)
 
-    def observe_step(self, variables: Variables, noise: StepNoise, action: jax.Array, state: LatentState,
+    def observe_step(self, variables: Variables, noise: StepNoise, state: LatentState, action: jax.Array,
                      embedding: jax.Array, is_first: jax.Array) -> tuple[LatentState, tuple[Gaussian, Gaussian]]:
-        """Moves the state one step and corrects it by an observation.
+        """Moves the state one step and corrects it by an observation. Inner layer: see muvo_jax.observe_step.
 
         Args:
           variables: of this model.
           noise: StepNoise [B, ...]; zeros give the mean mode.
-          action: [B, 2], the PREVIOUS action, applied between the last observation and this one.
           state: LatentState [B, ...].
+          action: [B, 2], the PREVIOUS action, applied between the last observation and this one.
           embedding: [B, E] ([B, M, C] with the 2D latent) of this observation.
           is_first: bool [B]; where true, state and action are replaced by zeros and the RSSM dropout is off.
 
@@ -241,15 +244,15 @@ class WorldModel:
           the state to go on from, and (prior, posterior). Its sample is the posterior's, or the prior's where
           noise.use_prior says so.
         """
-        return self._apply(variables, "observe_step", noise, action, state, embedding, is_first)
+        return self._apply(variables, "observe_step", noise, state, action, embedding, is_first)
 
-    def imagine_step(self, variables: Variables, noise: jax.Array, action: jax.Array,
-                     state: LatentState) -> tuple[LatentState, Gaussian]:
-        """Moves the state [B, ...] one step by action [B, 2] alone.
+    def imagine_step(self, variables: Variables, noise: jax.Array, state: LatentState,
+                     action: jax.Array) -> tuple[LatentState, Gaussian]:
+        """Moves the state [B, ...] one step by action [B, 2] alone. Inner layer: see muvo_jax.imagine_step.
 
         noise: standard normal numbers of the shape of the stochastic state, or zeros.
         """
-        return self._apply(variables, "imagine_step", noise, action, state)
+        return self._apply(variables, "imagine_step", noise, state, action)
 
     def ego_motion(self, variables: Variables, states: LatentState) -> jax.Array:
         """What the head of that name says of states [*L, ...]: [*L, 4], as Batch.ego_motion."""

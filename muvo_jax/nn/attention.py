@@ -16,6 +16,7 @@ import numpy as np
 from flax import linen
 
 from muvo_jax.nn import layers, norm
+from muvo_jax.ops import precision
 
 _TEMPERATURE = 10_000.0
 
@@ -69,7 +70,8 @@ class InProjection(linen.Module):
         channels, dtype = x.shape[-1], self.compute.dtype
         kernel = self.param("kernel", layers.shape_only, (channels, 3 * channels)).astype(dtype)
         bias = self.param("bias", layers.shape_only, (3 * channels,)).astype(dtype)
-        affine = lambda values, part: jnp.dot(values.astype(dtype), kernel[:, part]) + bias[part][None, None]
+        affine = lambda values, part: jnp.dot(values.astype(dtype), kernel[:, part],
+                                              precision=precision.PRODUCTS) + bias[part][None, None]
         if memory is x:
             query, key, value = jnp.split(affine(x, slice(None)), 3, axis=-1)
             return query, key, value
@@ -93,9 +95,10 @@ class Attention(linen.Module):
         head_channels = channels // self.heads
         query, key, value = (part.reshape(count, -1, self.heads, head_channels)
                              for part in InProjection(self.compute, name="in_proj")(x, memory))
-        scores = jnp.einsum("nqhc,nkhc->nhqk", query, key, preferred_element_type=jnp.float32)
+        scores = jnp.einsum("nqhc,nkhc->nhqk", query, key, precision=precision.PRODUCTS,
+                            preferred_element_type=jnp.float32)
         weights = dropout(jax.nn.softmax(scores / math.sqrt(head_channels), axis=-1), keys, site, self.dropout_rate)
-        mixed = jnp.einsum("nhqk,nkhc->nqhc", weights.astype(value.dtype), value)
+        mixed = jnp.einsum("nhqk,nkhc->nqhc", weights.astype(value.dtype), value, precision=precision.PRODUCTS)
         return layers.Dense(channels, self.compute, name="out_proj")(mixed.reshape(count, length, channels))
 
 

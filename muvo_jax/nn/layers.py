@@ -15,6 +15,7 @@ import jax.numpy as jnp
 from flax import linen
 
 from muvo_jax.ops import conv as conv_ops
+from muvo_jax.ops import precision
 
 
 @dataclasses.dataclass(frozen=True)
@@ -56,7 +57,7 @@ class Dense(linen.Module):
     @linen.compact
     def __call__(self, x: jax.Array) -> jax.Array:
         kernel = self.param("kernel", shape_only, (x.shape[-1], self.features))
-        y = jnp.dot(x.astype(self.compute.dtype), kernel.astype(self.compute.dtype))
+        y = jnp.dot(x.astype(self.compute.dtype), kernel.astype(self.compute.dtype), precision=precision.PRODUCTS)
         if self.use_bias:
             bias = self.param("bias", shape_only, (self.features,))
             y = y + per_channel(bias.astype(y.dtype), y.ndim)
@@ -134,7 +135,8 @@ class Unfold(linen.Module):
     def __call__(self, x: jax.Array) -> jax.Array:
         kernel = self.param("seed_kernel", shape_only, (*self.size, x.shape[-1], self.features))
         bias = self.param("bias", shape_only, (self.features,))
-        y = jnp.einsum("ni,...io->n...o", x.astype(self.compute.dtype), kernel.astype(self.compute.dtype))
+        y = jnp.einsum("ni,...io->n...o", x.astype(self.compute.dtype), kernel.astype(self.compute.dtype),
+                       precision=precision.PRODUCTS)
         return y + per_channel(bias.astype(y.dtype), y.ndim)
 
 

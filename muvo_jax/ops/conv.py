@@ -1,24 +1,27 @@
 """Channels-last convolutions, transposed convolutions and max pooling in one, two or three dimensions.
 
 The numbers are those of torch.nn.Conv*, ConvTranspose* and MaxPool* with channels last; the form of the computation is
-chosen by backend, here and nowhere else:
+chosen by the platform that a program is lowered for, here and nowhere else (not by the default backend: a program for
+the CPU of a machine with a GPU takes the CPU's form, and one that is exported for both has both):
 
-  "auto"  "gemm" on a CPU, elsewhere XLA's convolutions, with transposed ones split into phases.
+  "auto"  "gemm" on a CPU, elsewhere XLA's convolutions, with transposed ones split into phases; reverse-mode
+          differentiation only.
   "xla"   plain XLA, which also supports forward-mode differentiation (jvp, hessian).
   "gemm"  the forms of muvo_jax.ops.conv_cpu, transposed ones split into phases; reverse-mode differentiation only.
 """
 
 from __future__ import annotations
 
+import functools
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Literal
 
 import jax
 import jax.numpy as jnp
 from jax import lax
 
-from muvo_jax.ops import conv_cpu
+from muvo_jax.ops import conv_cpu, precision
 
 Implementation = Literal["auto", "xla", "gemm"]
 PerAxis = int | Sequence[int]
@@ -49,11 +52,7 @@ def conv(x, kernel, *, stride: PerAxis = 1, padding: PerAxis = 0, implementation
         return conv_cpu.plain(x, kernel, strides, pairs)
     if math.prod(taps) == 1:
         return _pointwise(x, kernel, strides, pairs)
-    if not _use_cpu_forms(implementation):
-        return conv_cpu.plain(x, kernel, strides, pairs)
-    if rank == 1:
-        return _cpu_conv(x[:, None], kernel[None], (1, *strides), ((0, 0), *pairs))[:, 0]
-    return _cpu_conv(x, kernel, strides, pairs)
+    return _formed(implementation, *_conv_forms(strides, pairs), x, kernel)
 
 
 def depthwise_conv(x, kernel, *, stride: int = 1, padding: int = 0, implementation: Implementation = "auto"):
@@ -75,19 +74,8 @@ def depthwise_conv(x, kernel, *, stride: int = 1, padding: int = 0, implementati
     if x.ndim != 4 or kernel.ndim != 4 or kernel.shape[2:] != (1, x.shape[-1]) or kernel.dtype != x.dtype:
         raise ValueError(f"depthwise_conv: got x {x.dtype}{list(x.shape)} and kernel {kernel.dtype}"
                          f"{list(kernel.shape)}, expected [N, H, W, C] and [K, K, 1, C] of one dtype.")
-    if implementation == "xla" or not _use_cpu_forms(implementation):
-        return lax.conv_general_dilated(x, kernel, (stride, stride), [(padding, padding)] * 2,
-                                        dimension_numbers=("NHWC", "HWIO", "NHWC"), feature_group_count=x.shape[-1])
-    rows, columns = ((side + 2 * padding - taps) // stride + 1
-                     for side, taps in zip(x.shape[1:3], kernel.shape[:2], strict=True))
-    padded = jnp.pad(x, ((0, 0), (padding, padding), (padding, padding), (0, 0)))
-    total = jnp.zeros((x.shape[0], rows, columns, x.shape[-1]), x.dtype)
-    for row in range(kernel.shape[0]):
-        for column in range(kernel.shape[1]):
-            part = lax.slice(padded, (0, row, column, 0), (x.shape[0], row + (rows - 1) * stride + 1,
-                             column + (columns - 1) * stride + 1, x.shape[-1]), (1, stride, stride, 1))
-            total = total + part * kernel[row, column].reshape(1, 1, 1, -1)
-    return total
+    shifted, grouped = _depthwise_forms(stride, padding)
+    return grouped(x, kernel) if implementation == "xla" else _formed(implementation, shifted, grouped, x, kernel)
 
 
 def conv_transpose(x, kernel, *, stride: PerAxis = 1, padding: PerAxis = 0, output_padding: PerAxis = 0,
@@ -183,15 +171,77 @@ def _per_axis(name: str, value: PerAxis, rank: int, lowest: int) -> tuple[int, .
     return values
 
 
-def _use_cpu_forms(implementation: str) -> bool:
-    return implementation == "gemm" or jax.default_backend() == "cpu"
+Form = Callable[[jax.Array, jax.Array], jax.Array]  # (x, kernel) -> result
+
+
+def _formed(implementation: str, cpu: Form, other: Form, x, kernel):
+    return cpu(x, kernel) if implementation == "gemm" else _by_platform(cpu, other, x, kernel)
+
+
+@functools.partial(jax.custom_vjp, nondiff_argnums=(0, 1))
+def _by_platform(cpu: Form, other: Form, x, kernel):
+    """One form on a CPU, another elsewhere, each with its own gradient.
+
+    Differentiating the choice itself would keep what both forms need for their gradients.
+    """
+    return lax.platform_dependent(x, kernel, cpu=cpu, default=other)
+
+
+def _by_platform_forward(cpu, other, x, kernel):
+    return _by_platform(cpu, other, x, kernel), (x, kernel)
+
+
+def _by_platform_backward(cpu, other, residuals, gradient):
+    return lax.platform_dependent(*residuals, gradient, cpu=_pull_back(cpu), default=_pull_back(other))
+
+
+_by_platform.defvjp(_by_platform_forward, _by_platform_backward)
+
+
+# The functions below are made once for each setting: where programs are not jitted, a new function would compile anew.
+@functools.cache
+def _pull_back(form: Form):
+    return lambda x, kernel, gradient: jax.vjp(form, x, kernel)[1](gradient)
+
+
+@functools.cache
+def _conv_forms(strides: tuple[int, ...], pairs: conv_cpu.Pairs) -> tuple[Form, Form]:
+    """The CPU's form of a convolution, and XLA's."""
+    if len(strides) == 1:
+        cpu = lambda x, kernel: _cpu_conv(x[:, None], kernel[None], (1, *strides), ((0, 0), *pairs))[:, 0]
+    else:
+        cpu = functools.partial(_cpu_conv, strides=strides, pairs=pairs)
+    return cpu, functools.partial(conv_cpu.plain, stride=strides, padding=pairs)
+
+
+@functools.cache
+def _depthwise_forms(stride: int, padding: int) -> tuple[Form, Form]:
+    """A sum of shifted products, and XLA's grouped convolution."""
+    def shifted(x, kernel):
+        rows, columns = ((side + 2 * padding - taps) // stride + 1
+                         for side, taps in zip(x.shape[1:3], kernel.shape[:2], strict=True))
+        padded = jnp.pad(x, ((0, 0), (padding, padding), (padding, padding), (0, 0)))
+        total = jnp.zeros((x.shape[0], rows, columns, x.shape[-1]), x.dtype)
+        for row in range(kernel.shape[0]):
+            for column in range(kernel.shape[1]):
+                part = lax.slice(padded, (0, row, column, 0), (x.shape[0], row + (rows - 1) * stride + 1,
+                                 column + (columns - 1) * stride + 1, x.shape[-1]), (1, stride, stride, 1))
+                total = total + part * kernel[row, column].reshape(1, 1, 1, -1)
+        return total
+
+    def grouped(x, kernel):
+        return lax.conv_general_dilated(x, kernel, (stride, stride), [(padding, padding)] * 2,
+                                        dimension_numbers=("NHWC", "HWIO", "NHWC"), feature_group_count=x.shape[-1],
+                                        precision=precision.PRODUCTS)
+
+    return shifted, grouped
 
 
 def _pointwise(x, kernel, strides, pairs):
     """A kernel of one tap is a matrix product."""
     x = jnp.pad(x, ((0, 0), *pairs, (0, 0)))
     x = x[(slice(None), *(slice(None, None, step) for step in strides))]
-    return lax.dot_general(x, kernel.reshape(kernel.shape[-2:]), (((x.ndim - 1,), (0,)), ((), ())))
+    return jnp.dot(x, kernel.reshape(kernel.shape[-2:]), precision=precision.PRODUCTS)
 
 
 def _cpu_conv(x, kernel, strides, pairs):
@@ -208,7 +258,8 @@ def _dilated(x, kernel, strides, pads, outs):
                   for n, k, s, p, o in zip(x.shape[1:-1], taps, strides, pads, outs, strict=True))
     space = "XYZ"[:rank]
     return lax.conv_general_dilated(x, jnp.flip(kernel, tuple(range(rank))), (1,) * rank, edges, lhs_dilation=strides,
-                                    dimension_numbers=(f"N{space}C", f"{space}IO", f"N{space}C"))
+                                    dimension_numbers=(f"N{space}C", f"{space}IO", f"N{space}C"),
+                                    precision=precision.PRODUCTS)
 
 
 def _from_one_pixel(x, kernel, pads, outs):
@@ -217,7 +268,7 @@ def _from_one_pixel(x, kernel, pads, outs):
     rank = len(taps)
     pixel = x.reshape(x.shape[0], channels_in)
     weights = jnp.moveaxis(kernel, -2, 0).reshape(channels_in, -1)
-    painted = (pixel @ weights).reshape(x.shape[0], *taps, channels_out)
+    painted = jnp.dot(pixel, weights, precision=precision.PRODUCTS).reshape(x.shape[0], *taps, channels_out)
     edges = [(-p, o + p - k, 0) for p, o, k in zip(pads, outs, taps, strict=True)]
     return lax.pad(painted, jnp.zeros((), painted.dtype), ((0, 0, 0), *edges[:rank], (0, 0, 0)))
 
@@ -236,10 +287,7 @@ def _phases(x, kernel, strides, pads, outs, implementation):
     kernel = kernel.reshape(*reads, channels_in, math.prod(strides) * channels_out)
     pairs = tuple((q - 1 - f, e - (n - 1))
                   for q, f, e, n in zip(reads, first, last, x.shape[1:-1], strict=True))
-    if _use_cpu_forms(implementation):
-        dense = conv_cpu.dense(x, kernel, pairs)
-    else:
-        dense = conv_cpu.plain(x, kernel, (1,) * rank, pairs)
+    dense = _formed(implementation, *_conv_forms((1,) * rank, pairs), x, kernel)
     full = conv_cpu.depth_to_space(dense, strides)
     starts = [p - f * s for p, f, s in zip(pads, first, strides, strict=True)]
     return lax.slice(full, (0, *starts, 0), (full.shape[0], *(a + o for a, o in zip(starts, outs, strict=True)),

@@ -20,6 +20,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
+from muvo_jax.ops import precision
+
 Pairs = tuple[tuple[int, int], ...]
 
 _CHUNK_BYTES = 1 << 20  # what one pass over the kernel taps reads: half of a core's second-level cache
@@ -31,7 +33,8 @@ def plain(x, kernel, stride: tuple[int, ...], padding: Pairs, kernel_dilation: t
     """XLA's convolution of channels-last `x` [N, *S, C] with `kernel` [*K, C, O]."""
     space = "XYZ"[: kernel.ndim - 2]
     return lax.conv_general_dilated(x, kernel, stride, padding, rhs_dilation=kernel_dilation,
-                                    dimension_numbers=(f"N{space}C", f"{space}IO", f"N{space}C"))
+                                    dimension_numbers=(f"N{space}C", f"{space}IO", f"N{space}C"),
+                                    precision=precision.PRODUCTS)
 
 
 def _xla_gradient_is_fast(x, kernel, gradient) -> bool:
@@ -103,7 +106,8 @@ def _kernel_gradient(x, gradient, taps: tuple[int, int], dilation: tuple[int, in
         def product(tap):
             start = (sample, row + (tap // taps[1]) * dilation[0], (tap % taps[1]) * dilation[1], 0)
             inner = lax.dynamic_slice(x, start, (samples, chunk_rows, columns, channels_in))
-            return lax.dot_general(inner, outer, contract, preferred_element_type=total.dtype)
+            return lax.dot_general(inner, outer, contract, precision=precision.PRODUCTS,
+                                   preferred_element_type=total.dtype)
 
         return total + lax.map(product, jnp.arange(math.prod(taps))), None
 
@@ -178,7 +182,7 @@ def _band(kernel, inputs: int, outputs: int, offset: int):
     tap = np.arange(inputs)[:, None] - np.arange(outputs)[None] + offset
     placement = (tap[None] == np.arange(z_taps)[:, None, None]).astype(np.float32)
     band = jnp.einsum("xytco,tij->xyicjo", kernel, jnp.asarray(placement, kernel.dtype),
-                      precision=lax.Precision.HIGHEST)
+                      precision=precision.PRODUCTS)
     return band.reshape(x_taps, y_taps, inputs * channels_in, outputs * channels_out)
 
 

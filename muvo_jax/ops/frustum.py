@@ -13,6 +13,7 @@ import jax
 import jax.numpy as jnp
 
 from muvo_jax.geometry import BirdsEyeGrid
+from muvo_jax.ops import precision
 
 HEIGHT_RANGE_M = (-30.0, 10.0)  # the reference's: practically everything
 
@@ -43,8 +44,8 @@ def frustum_points(intrinsics: jax.Array, camera_to_ego: jax.Array, map_size: tu
     pixels = jnp.stack([u_px, v_px, jnp.ones_like(u_px)], axis=-1)
     scaled = jnp.expand_dims(pixels, 0) * depth_m[:, None, None, None]
     to_ego = jnp.einsum("bij,bjk->bik", camera_to_ego[:, :3, :3], jnp.linalg.inv(intrinsics),
-                        precision=jax.lax.Precision.HIGHEST)
-    points = jnp.einsum("bij,dhwj->bdhwi", to_ego, scaled, precision=jax.lax.Precision.HIGHEST)
+                        precision=precision.PRODUCTS)
+    points = jnp.einsum("bij,dhwj->bdhwi", to_ego, scaled, precision=precision.PRODUCTS)
     return points + camera_to_ego[:, None, None, None, :3, 3]
 
 
@@ -111,7 +112,7 @@ def lift_splat(features: jax.Array, probabilities: jax.Array, cells: jax.Array, 
         size = (grid.cells**2 + 1) * pixels
         weights = jnp.zeros((size,), jnp.float32).at[place.reshape(-1)].add(probability.reshape(-1))
         weights = weights[:-pixels].reshape(grid.cells**2, pixels)
-        return jnp.dot(weights.astype(feature.dtype), feature)
+        return jnp.dot(weights.astype(feature.dtype), feature, precision=precision.PRODUCTS)
 
     pooled = jax.vmap(one)(features, probabilities, cells)
     return pooled.reshape(-1, grid.cells, grid.cells, features.shape[-1])

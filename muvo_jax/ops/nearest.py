@@ -82,7 +82,7 @@ def chamfer_sums(points, targets, point_mask, target_mask, *, chunk: int = 256) 
         distance = nearest_distance(source, other, other_mask, chunk=chunk)
         counted = mask & defined
         sums.append(jnp.sum(jnp.where(counted, distance, jnp.zeros_like(distance))))
-        sums.append(jnp.sum(counted.astype(distance.dtype)))
+        sums.append(jnp.sum(counted).astype(distance.dtype))
     return tuple(sums)
 
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 import jax
 import jax.numpy as jnp
 
+from muvo_jax.ops import precision
 from muvo_jax.types import Array
 
 _LUMA = (0.2989, 0.587, 0.114)
@@ -24,7 +25,7 @@ def blur(image: Array, std_px: Array | float) -> Array:
     for axis, pixels in ((0, rows), (1, columns)):
         padded = jnp.pad(image, [(half, half) if side == axis else (0, 0) for side in range(3)], mode="reflect")
         shifted = [jax.lax.slice_in_dim(padded, shift, shift + pixels, axis=axis) for shift in range(_BLUR_PX)]
-        image = jnp.tensordot(weights, jnp.stack(shifted), axes=1)
+        image = jnp.tensordot(weights, jnp.stack(shifted), axes=1, precision=precision.PRODUCTS)
     return image
 
 
@@ -69,7 +70,8 @@ def hue(image: Array, turn: Array | float) -> Array:
 
 
 def _grey(image: Array) -> Array:
-    return jnp.broadcast_to((image @ jnp.asarray(_LUMA, image.dtype))[..., None], image.shape)
+    grey = jnp.dot(image, jnp.asarray(_LUMA, image.dtype), precision=precision.PRODUCTS)
+    return jnp.broadcast_to(grey[..., None], image.shape)
 
 
 def _blend(image: Array, other: Array, factor: Array | float) -> Array:

@@ -5,6 +5,7 @@ A run is exact: step n always sees the same windows and the same randomness, whe
 
 from __future__ import annotations
 
+import collections
 import concurrent.futures
 import dataclasses
 import functools
@@ -12,6 +13,7 @@ import math
 import pathlib
 import time
 from collections.abc import Callable, Collection, Iterator, Mapping
+from typing import NoReturn
 
 import jax
 
@@ -20,6 +22,8 @@ from muvo_jax import types
 from muvo_jax.data import pipeline, prepare, schema
 from muvo_jax.objectives import perceptual
 from muvo_jax.training import checkpoint, checkpoint_meta, host, preparation, run_folder, screen, start, validation
+
+_STEPS_LATE = 4  # a step is looked at when so many later ones run: what it copied to the host has arrived by then
 
 Preview = Callable[[pathlib.Path, validation.Validator, types.Variables, str], None]
 
@@ -175,11 +179,11 @@ class _Run:
         self.keeper, self.files, self.validator, self.origin = keeper, files, validator, origin
         self.state, self.done, self.saved = state, done, done if keeper.steps() else None
         self.step_times_s: list[float] = []
+        self.unchecked: collections.deque[tuple[int, Mapping]] = collections.deque()
 
     def loop(self, source: pipeline.TrainBatches, making_s: float) -> Outcome:
         settings, pace = self.config.train, screen.Pace()
         feed = pipeline.prefetch_to_device(_Placed(source, self.ready.step.place))
-        unchecked: tuple[int, Mapping] | None = None
         with feed, host.StopRequest() as stop:
             self.show.start(settings.steps, self.done)
             while self.done < settings.steps and not stop.requested:
@@ -188,13 +192,11 @@ class _Run:
                 self.state, metrics = self.ready.step(self.state, batch)
                 first = not self.step_times_s
                 self.done += 1
-                if unchecked:  # one step late, so that the device does not wait for the host
-                    self._check(*unchecked)
-                unchecked = (self.done, metrics)
+                metrics["finite"].copy_to_host_async()
+                self.unchecked.append((self.done, metrics))
                 due = _due(self.done, settings)
-                if first or due.log or due.any_pause or self.done == settings.steps:
-                    self._check(self.done, metrics)
-                    unchecked = None
+                at_once = first or due.log or due.any_pause or self.done == settings.steps
+                self._check(0 if at_once else _STEPS_LATE)
                 self.step_times_s.append(time.perf_counter() - start_s)
                 pace.step(feed.waited_s - waited_s)
                 if first:
@@ -205,14 +207,21 @@ class _Run:
                 if due.any_pause and self.done < settings.steps:
                     self._pause(due, feed.get_state())
                     pace.restart()
-            if unchecked:
-                self._check(*unchecked)
+            self._check(0)
             self._finish(stop.requested, feed.get_state())
         return Outcome(self.config, self.done, stop.requested and self.done < settings.steps)
 
-    def _check(self, step: int, metrics: Mapping) -> None:
-        if float(metrics["finite"]) == 1.0:
-            return
+    def _check(self, late: int) -> None:
+        """Looks at all steps but the last `late`: neither does the device wait for the host, nor do batches pile up.
+
+        A step that was not finite has changed nothing; its successors ran from the same parameters.
+        """
+        while len(self.unchecked) > late:
+            step, metrics = self.unchecked.popleft()
+            if float(metrics["finite"]) != 1.0:
+                self._stop(step, metrics)
+
+    def _stop(self, step: int, metrics: Mapping) -> NoReturn:
         values = {name: float(value) for name, value in metrics.items()}
         bad = [f"{name} = {value}" for name, value in values.items() if not math.isfinite(value)]
         self.files.log({"kind": "non_finite", "step": step, **values})
@@ -278,10 +287,10 @@ class _Run:
             self._save(data_state)
         if stopped and self.done < total:
             self.show.line(f"stopped at step {self.done} of {total}; saved. Go on with:  {self.job.resume_command}")
-        steady_s = sorted(self.step_times_s[1:])
+        steady_s = self.step_times_s[1:]
         if steady_s:
-            median_s, age_s = steady_s[len(steady_s) // 2], time.perf_counter() - self.job.started_s
-            self.show.line(f"{len(self.step_times_s)} steps, median {median_s:.3f} s each; peak memory "
+            mean_s, age_s = sum(steady_s) / len(steady_s), time.perf_counter() - self.job.started_s
+            self.show.line(f"{len(self.step_times_s)} steps, {mean_s:.3f} s each on average; peak memory "
                            f"{host.peak_memory_gib():.2f} GiB; {screen.duration_text(age_s)} since the start")
         elif not self.step_times_s:
             self.show.line(f"nothing left to train: step {self.done} of {total} is reached (more with --steps).")

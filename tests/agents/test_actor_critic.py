@@ -6,6 +6,7 @@ import numpy as np
 from worlds import make
 
 from muvo_jax.agents import actor_critic
+from muvo_jax.agents import environment as environment_lib
 
 
 def test_lambda_returns_by_hand():
@@ -41,3 +42,17 @@ def test_it_learns_to_brake_where_braking_pays():
     assert abs(np.mean(rewards[:3])) < 0.3 and np.mean(rewards[-5:]) > 0.5
     action = actor_critic.policy(config, learner.actor, sampled=False)(None, params.bank.latent.features[0])
     assert action[0] < -0.4
+
+
+def test_policies_of_one_config_compile_once_whatever_their_weights():
+    environment, params = make()
+    config = actor_critic.ActorCriticConfig(width=8, layers=1)
+    _, state = environment.reset(jax.random.key(0), params)
+    actor = actor_critic.init(jax.random.key(0), environment, config).actor
+    rewards, compiled = [], []
+    for shift in (0.0, 0.5):  # fresh actors all drive straight on
+        moved = actor_critic.policy(config, jax.tree.map(lambda leaf, shift=shift: leaf + shift, actor))
+        _, transitions = environment_lib.play(environment, params, jax.random.key(1), state, moved, 2)
+        rewards.append(transitions.reward)
+        compiled.append(environment_lib.play._cache_size())
+    assert compiled[0] == compiled[1] and not np.allclose(*rewards)

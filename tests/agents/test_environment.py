@@ -113,7 +113,7 @@ def test_what_does_not_fit_is_refused():
     with pytest.raises(ValueError, match=r"action \[3\], expected \[2\]"):
         environment.step(jax.random.key(0), state, jnp.zeros(3), params)
     with pytest.raises(ValueError, match="reach from 2 to 2"):
-        environment.step(jax.random.key(0), state, jnp.full((2,), 2.0), params)
+        environment.step(jax.random.key(0), state, np.full((2,), 2.0), params)
     none = dataclasses.replace(environment.contract, kinematics="none")
     with pytest.raises(ValueError, match="or pass a reward_function"):
         dataclasses.replace(environment, contract=none)

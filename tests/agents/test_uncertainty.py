@@ -26,6 +26,13 @@ def test_the_reliability_curve_by_hand():
     np.testing.assert_allclose(curve.calibration_error, (0.35 + 0.05) / 2, rtol=1e-4)
 
 
+def test_the_reliability_curve_counts_beyond_what_float32_can_count():
+    voxels = 2**24 + 64
+    curve = jax.jit(uncertainty.reliability)(jnp.full(voxels, 0.75), jnp.zeros(voxels, jnp.uint8))
+    assert curve.count[7] == curve.count.sum() == voxels
+    np.testing.assert_allclose(curve.confidence[7], 0.75, rtol=1e-6)
+
+
 def test_crps_is_the_sum_over_pairs():
     samples, truth = jnp.array([1.0, 4.0, 2.0]), jnp.float32(3.0)
     np.testing.assert_allclose(uncertainty.crps(samples, truth), (2 + 1 + 1) / 3 - (3 + 1 + 2) / 6, rtol=1e-5)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from muvo_jax import presets
-from muvo_jax.model import rollout, world_model
+from muvo_jax.model import checks, rollout, world_model
 from muvo_jax.types import Batch, LatentState
 
 CONFIG = presets.get("tiny").model
@@ -91,7 +91,7 @@ def test_imagine_equals_a_loop_by_hand(variables, state, actions):
     np.testing.assert_array_equal(dream.actions, actions)
     current = state
     for step in range(HORIZON):
-        current, prior = MODEL.imagine_step(variables, jnp.zeros_like(state.stochastic), actions[:, step], current)
+        current, prior = MODEL.imagine_step(variables, jnp.zeros_like(state.stochastic), current, actions[:, step])
         assert_close((dream.states[:, step], dream.prior[:, step]), (current, prior))
 
 
@@ -121,7 +121,14 @@ def test_imagine_step_takes_any_leading_axes_and_compiles_once(variables, state,
     with pytest.raises(ValueError, match=r"imagine_step: got action \[2\], expected \[2, 2\]"):
         step(jax.random.key(1), state, actions[0, 0])
     with pytest.raises(ValueError, match="reach from 3 to 3"):
-        step(jax.random.key(1), state, jnp.full((BATCH, 2), 3.0))
+        step(jax.random.key(1), state, np.full((BATCH, 2), 3.0))
+
+
+def test_actions_on_a_device_are_clipped_there_and_never_looked_at(variables, state, monkeypatch):
+    step = lambda action: rollout.imagine_step(MODEL, variables, jax.random.key(1), state, action)
+    largest = step(np.ones((BATCH, 2), np.float32))
+    monkeypatch.setattr(checks, "action_values", lambda *_: pytest.fail("the host waited for the device"))
+    assert_close(step(jnp.full((BATCH, 2), 3.0)), largest)
 
 
 def test_branches_are_independent_futures(variables, state, actions):
@@ -147,6 +154,17 @@ def test_the_learned_policy_is_the_action_head(variables, state):
                             horizon=2)
     np.testing.assert_allclose(dream.actions[:, 0], rollout.decode(MODEL, variables, state, ("action",)).action,
                                atol=1e-6)
+
+
+def test_the_learned_policy_compiles_once_whatever_its_weights(variables, state):
+    drive = lambda weights: rollout.imagine(MODEL, variables, jax.random.key(2), state,
+                                            rollout.learned_policy(MODEL, weights), horizon=2)
+    first = drive(variables)
+    before = rollout._imagine._cache_size()
+    drive(variables)
+    other = drive(jax.tree.map(lambda leaf: 2 * leaf, variables))
+    assert rollout._imagine._cache_size() == before
+    assert not np.allclose(first.actions, other.actions)
 
 
 def test_gradients_reach_actions_and_the_start_state(variables, state, actions):

@@ -37,7 +37,6 @@ def state():
 
 
 filter_window = jax.jit(lambda variables, *window: rollout.filter_embeddings(MODEL, variables, *window))
-imagine_step = jax.jit(MODEL.imagine_step)
 
 
 def assert_close(first, second, tolerance=2e-5):
@@ -118,7 +117,7 @@ def test_scan_equals_a_loop_by_hand(variables, window):
     state = MODEL.initial_state(BATCH)
     for index in range(FRAMES):
         previous = action[:, index - 1] if index else jnp.zeros((BATCH, 2))
-        state, (prior, posterior) = step(variables, noise[:, index], previous, state, embedding[:, index],
+        state, (prior, posterior) = step(variables, noise[:, index], state, previous, embedding[:, index],
                                          is_first[:, index])
         coin = noise.use_prior[:, index, None, None] & (index > 0)
         carried = np.where(coin, prior.sample(noise.prior[:, index]), posterior.sample(noise.posterior[:, index]))
@@ -202,7 +201,7 @@ def test_the_posterior_of_the_reference_does_not_mark_its_memory(variables, wind
         # The transition alone: the decoders of the other numerics have other shapes.
         module = token_transition.TokenTransition(dataclasses.replace(CONFIG, numerics=numerics))
         step = jax.jit(lambda params, module=module: module.apply(
-            {"params": params["params"]["transition"]}, noise, action, start, embedding, is_first,
+            {"params": params["params"]["transition"]}, noise, start, action, embedding, is_first,
             method="observe_step")[1])
         differs = [bool(np.abs(a.mean - b.mean).max() > 1e-4) for a, b in
                    zip(step(variables), step(moved), strict=True)]

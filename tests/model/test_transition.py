@@ -59,7 +59,7 @@ def test_scan_equals_a_loop_by_hand(variables, window):
     state = MODEL.initial_state(BATCH)
     for step in range(FRAMES):
         previous = action[:, step - 1] if step else jnp.zeros((BATCH, 2))
-        state, (prior, posterior) = MODEL.observe_step(variables, noise[:, step], previous, state, embedding[:, step],
+        state, (prior, posterior) = MODEL.observe_step(variables, noise[:, step], state, previous, embedding[:, step],
                                                        is_first[:, step])
         carried = np.where(noise.use_prior[:, step, None] & (step > 0), prior.sample(noise.prior[:, step]),
                            posterior.sample(noise.posterior[:, step]))
@@ -84,7 +84,7 @@ def test_prior_dropout_never_changes_a_first_step(variables, window):
     embedding, action, _, noise = window
     always = StepNoise(noise.prior[:, 0], noise.posterior[:, 0], jnp.ones((BATCH,), bool))
     for is_first, kind in ((True, 1), (False, 0)):
-        state, gaussians = MODEL.observe_step(variables, always, action[:, 0], MODEL.initial_state(BATCH),
+        state, gaussians = MODEL.observe_step(variables, always, MODEL.initial_state(BATCH), action[:, 0],
                                               embedding[:, 0], jnp.full((BATCH,), is_first))
         expected = gaussians[kind].sample((always.prior, always.posterior)[kind])
         np.testing.assert_allclose(state.stochastic, expected, atol=1e-6)
@@ -93,8 +93,8 @@ def test_prior_dropout_never_changes_a_first_step(variables, window):
 def test_the_action_enters_the_latents_and_not_the_recurrence(variables):
     state = LatentState(jnp.full((1, CONFIG.deterministic_channels), 0.3), jnp.full((1, CHANNELS), 0.2))
     silence = jnp.zeros((1, CHANNELS))
-    left, prior_left = MODEL.imagine_step(variables, silence, jnp.float32([[0.0, -1.0]]), state)
-    right, prior_right = MODEL.imagine_step(variables, silence, jnp.float32([[0.0, 1.0]]), state)
+    left, prior_left = MODEL.imagine_step(variables, silence, state, jnp.float32([[0.0, -1.0]]))
+    right, prior_right = MODEL.imagine_step(variables, silence, state, jnp.float32([[0.0, 1.0]]))
     np.testing.assert_array_equal(left.deterministic, right.deterministic)
     assert not np.allclose(prior_left.mean, prior_right.mean)
 
@@ -105,7 +105,7 @@ def test_reference_numerics_make_the_heads_affine(variables):
     def mean(numerics, scale):
         model = world_model.WorldModel(dataclasses.replace(CONFIG, numerics=numerics))
         action = scale * jnp.float32([[0.5, -0.5]])
-        return model.imagine_step(variables, silence, action, MODEL.initial_state(1))[1].mean
+        return model.imagine_step(variables, silence, MODEL.initial_state(1), action)[1].mean
 
     curvature = lambda numerics: np.abs(mean(numerics, 2.0) - 2 * mean(numerics, 0.0) + mean(numerics, -2.0)).max()
     assert curvature("reference") < 1e-5 < curvature("standard")

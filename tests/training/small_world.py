@@ -52,7 +52,7 @@ class SmallNetwork(linen.Module):
 
     def everything(self, image, range_view, noise, action, state, is_first):
         embedding = self.encode(image, range_view, norm.Mode(), None)
-        return self.decode(self.observe_step(noise, action, state, embedding, is_first)[0].features, self.config.heads)
+        return self.decode(self.observe_step(noise, state, action, embedding, is_first)[0].features, self.config.heads)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -18,6 +18,7 @@ from muvo_jax import presets
 from muvo_jax.data import schema
 from muvo_jax.model import world_model
 from muvo_jax.training import checkpoint, checkpoint_meta, integrity, loop, preparation, run_folder, screen
+from muvo_jax.training import step as step_lib
 
 STEPS = 6
 INTRINSICS = ((32.0, 0.0, 32.0), (0.0, 32.0, 16.0), (0.0, 0.0, 1.0))
@@ -250,6 +251,36 @@ def test_a_loss_that_is_not_finite_stops_the_run_by_name(tmp_path):
     with pytest.raises(loop.NonFiniteLossError, match=r"step \d: the loss is not finite: .*= (nan|inf).*checkpoint"):
         _train(tmp_path / "run", config=config)
     assert run_folder.read_metrics(tmp_path / "run")[-1]["kind"] == "non_finite"
+
+
+class Flag:
+    """A step's "finite", which notes after how many steps it was read."""
+
+    def __init__(self, value, step, done, reads):
+        self.value, self.step, self.done, self.reads = value, step, done, reads
+
+    def copy_to_host_async(self):
+        self.reads.setdefault(self.step, None)
+
+    def __float__(self):
+        self.reads[self.step] = len(self.done)
+        return float(self.value)
+
+
+def test_whether_a_step_was_finite_is_read_late_and_for_every_step(tmp_path, monkeypatch):
+    done, reads, call = [], {}, step_lib.SpreadFunction.__call__
+
+    def noted(self, state, batch):
+        result = call(self, state, batch)
+        if not isinstance(result, tuple):
+            return result  # of validation
+        state, metrics = result
+        done.append(None)
+        return state, metrics | {"finite": Flag(metrics["finite"], len(done), done, reads)}
+
+    monkeypatch.setattr(step_lib.SpreadFunction, "__call__", noted)
+    _train(tmp_path / "run", config=_config(steps=12, log_every=8, validate_every=0, checkpoint_every=0))
+    assert reads == {1: 1, 2: 6, 3: 7} | dict.fromkeys(range(4, 9), 8) | dict.fromkeys(range(9, 13), 12)
 
 
 def test_bad_data_leaves_no_run_folder_behind(tmp_path):

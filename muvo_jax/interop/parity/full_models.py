@@ -162,8 +162,8 @@ def _deployed(model: world_model.WorldModel, variables: Any, embedding: jax.Arra
     state = model.initial_state(1)
     zeros = jnp.zeros_like(state.stochastic)
     noise = StepNoise(zeros, zeros, jnp.zeros((1,), bool))
-    seen, _ = jax.jit(model.observe_step)(variables, noise, action, state, embedding[:, -1], jnp.zeros((1,), bool))
-    dreamt, _ = jax.jit(model.imagine_step)(variables, zeros, action, seen)
+    seen, _ = jax.jit(model.observe_step)(variables, noise, state, action, embedding[:, -1], jnp.zeros((1,), bool))
+    dreamt, _ = jax.jit(model.imagine_step)(variables, zeros, seen, action)
     for place, state in (("deployment", last), ("deployment_forward/0", seen), ("deployment_forward/1", seen),
                          ("deployment_forward/2", dreamt)):
         driven = rollout.decode(model, variables, state, ("action",)).action[:, None]

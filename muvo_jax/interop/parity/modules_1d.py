@@ -172,7 +172,7 @@ def transition_checks(context: cases.Context, config: config_lib.ModelConfig, na
                 yield cases.Check(f"{entries}/{kind}/{entry}", moved(value), TOLERANCE)
         state, dreamt = observed.last, []
         for step in range(imagined):
-            state, prior = imagine_step(variables, noises[2 * steps + step], actions[:, steps + step], state)
+            state, prior = imagine_step(variables, noises[2 * steps + step], state, actions[:, steps + step])
             dreamt.append((state.deterministic, state.stochastic, prior.mean, prior.std))
         for entry, *values in zip(("hidden_state", "sample", "mu", "sigma"), *dreamt, strict=True):
             yield cases.Check(f"{entries}/imagine/{entry}", moved(np.stack(values, 1)), TOLERANCE)

@@ -9,18 +9,46 @@
 Everything is a pure function of explicit pytrees; see docs/design.md.
 """
 
-from muvo_jax import presets
-from muvo_jax.config import Config, ModelConfig
-from muvo_jax.model.live import LiveState, observe_step, start_live
-from muvo_jax.model.rollout import decode, imagine, observe
-from muvo_jax.model.world_model import WorldModel
-from muvo_jax.types import Batch, Dream, Gaussian, LatentState, Observed
+import importlib
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from muvo_jax import presets
+    from muvo_jax.config import Config, ModelConfig
+    from muvo_jax.model.live import LiveState, observe_step, start_live
+    from muvo_jax.model.rollout import decode, imagine, observe
+    from muvo_jax.model.world_model import WorldModel
+    from muvo_jax.types import Batch, Dream, Gaussian, LatentState, Observed
 
 __all__ = [
     "Batch", "Config", "Dream", "Gaussian", "LatentState", "LiveState", "ModelConfig", "Observed", "WorldModel",
     "decode", "imagine", "load", "observe", "observe_step", "presets", "start_live",
     "windows",
 ]
+
+# Where names come from. Each is imported when it is first used: a command's --help needs no JAX.
+_MODULES = ("config", "geometry", "model", "nn", "ops", "presets", "types")
+_HOMES = {
+    "config": ("Config", "ModelConfig"),
+    "model.live": ("LiveState", "observe_step", "start_live"),
+    "model.rollout": ("decode", "imagine", "observe"),
+    "model.world_model": ("WorldModel",),
+    "types": ("Batch", "Dream", "Gaussian", "LatentState", "Observed"),
+}
+
+
+def __getattr__(name):
+    if name in _MODULES:
+        return importlib.import_module(f"muvo_jax.{name}")
+    for home, names in _HOMES.items():
+        if name in names:
+            globals()[name] = getattr(importlib.import_module(f"muvo_jax.{home}"), name)
+            return globals()[name]
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+
+
+def __dir__():
+    return sorted({*globals(), *__all__})
 
 
 def load(run):

@@ -11,12 +11,14 @@ from typing import Annotated
 import numpy as np
 import tyro
 
-from muvo_jax import command_line
-from muvo_jax import config as config_lib
-from muvo_jax.data import checkup, schema, sources
-from muvo_jax.ops import voxels as voxel_ops
-from muvo_jax.training import screen
-from muvo_jax.viz import canvas, checks
+from muvo_jax import command_line, late
+
+with late.imports():
+    from muvo_jax import config as config_lib
+    from muvo_jax.data import checkup, schema, sources
+    from muvo_jax.ops import voxels as voxel_ops
+    from muvo_jax.training import screen
+    from muvo_jax.viz import canvas, checks
 
 
 @dataclasses.dataclass(frozen=True)

@@ -10,15 +10,18 @@ import sys
 from collections.abc import Mapping
 from typing import Annotated, Any
 
-import jax
 import rich.table
 import tyro
 
-from muvo_jax import command_line
-from muvo_jax import config as config_lib
-from muvo_jax.data import pipeline, prepare
-from muvo_jax.metrics import protocol
-from muvo_jax.training import checkpoint_meta, screen, validation
+from muvo_jax import command_line, late
+
+with late.imports():
+    import jax
+
+    from muvo_jax import config as config_lib
+    from muvo_jax.data import pipeline, prepare, words
+    from muvo_jax.metrics import protocol
+    from muvo_jax.training import checkpoint_meta, screen, validation
 
 # metric -> (label, decimals, whether higher is better)
 METRICS = {
@@ -117,7 +120,8 @@ def fit(config: config_lib.Config, recording, chosen: tuple[str, ...]) -> config
 def screen_table(split: str, phase: str, scores: Mapping[str, Any]) -> rich.table.Table:
     """One split and phase: a row for each metric, the best source bold."""
     phase_scores = scores[phase]
-    table = rich.table.Table(title=f"{split}: {phase} frames, {scores['windows']} windows", title_justify="left")
+    windows = words.counted(scores["windows"], "window")
+    table = rich.table.Table(title=f"{split}: {phase} frames, {windows}", title_justify="left")
     table.add_column("metric")
     for source in phase_scores:
         table.add_column(SOURCES[source], justify="right")
@@ -181,7 +185,7 @@ def markdown(report: Mapping[str, Any]) -> str:
              f"{report['training_mean_frames']} frames. Bold is best. Chamfer and PSNR are means over frames; voxel "
              f"scores come from counts over the whole split.", ""]
     for split, scores in report["splits"].items():
-        lines += [f"## {split} ({scores['windows']} windows)", ""]
+        lines += [f"## {split} ({words.counted(scores['windows'], 'window')})", ""]
         for phase in protocol.PHASES:
             lines += [f"### {phase} frames", "", *_average_table(scores[phase]), ""]
         lines += ["### imagined frames, step by step", "", *_step_table(scores["imagined"]), "",

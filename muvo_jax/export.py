@@ -19,17 +19,19 @@ import sys
 from collections.abc import Callable, Mapping
 from typing import Annotated, Any
 
-import jax
-import jax.export
-import jax.numpy as jnp
 import numpy as np
 import tyro
 
-from muvo_jax import command_line, types
-from muvo_jax import config as config_lib
-from muvo_jax.model import live as live_lib
-from muvo_jax.model import rollout, world_model
-from muvo_jax.training import screen
+from muvo_jax import command_line, late
+
+with late.imports():
+    import jax
+
+    from muvo_jax import config as config_lib
+    from muvo_jax import types
+    from muvo_jax.model import live as live_lib
+    from muvo_jax.model import rollout, world_model
+    from muvo_jax.training import screen
 
 PLATFORMS = ("cpu", "cuda")
 SIGNATURES = "signatures.json"
@@ -117,9 +119,9 @@ def functions(model: world_model.WorldModel, weights: Mapping[str, Any], config:
     array = lambda dtype, *shape: jax.ShapeDtypeStruct((batch, *shape), dtype)
     flat = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype), dict(weights))
     one = model.initial_state(1)
-    state = {name: array(jnp.float32, *getattr(one, name).shape[1:]) for name in ("deterministic", "stochastic")}
-    keys = array(jnp.uint32, *jax.random.key_data(jax.random.key(0)).shape)
-    live = {**state, "keys": keys, "frame": array(jnp.int32)}
+    state = {name: array(jax.numpy.float32, *getattr(one, name).shape[1:]) for name in ("deterministic", "stochastic")}
+    keys = array(jax.numpy.uint32, *jax.random.key_data(jax.random.key(0)).shape)
+    live = {**state, "keys": keys, "frame": array(jax.numpy.int32)}
     observation = {name: array(leaf.dtype, *leaf.shape) for name, leaf in inputs(config).items()}
 
     def observe_step(weights, live, observation, previous_action):
@@ -136,10 +138,10 @@ def functions(model: world_model.WorldModel, weights: Mapping[str, Any], config:
     def decode(head, weights, state):
         return rollout.decode(model, unflatten(weights), types.LatentState(**state), (head,))[head][1]
 
-    temperature = jax.ShapeDtypeStruct((), jnp.float32)
+    temperature = jax.ShapeDtypeStruct((), jax.numpy.float32)
     made: dict[str, tuple[Callable, tuple]] = {
-        "observe_step": (observe_step, (flat, live, observation, array(jnp.float32, 2))),
-        "imagine": (imagine, (flat, keys, state, array(jnp.float32, horizon, 2), temperature))}
+        "observe_step": (observe_step, (flat, live, observation, array(jax.numpy.float32, 2))),
+        "imagine": (imagine, (flat, keys, state, array(jax.numpy.float32, horizon, 2), temperature))}
     for head in model.config.heads:
         made[f"decode_{head}"] = (lambda weights, state, head=head: decode(head, weights, state), (flat, state))
     return made

@@ -10,9 +10,11 @@ from typing import Annotated
 
 import tyro
 
-from muvo_jax import command_line
-from muvo_jax.data import records, shards
-from muvo_jax.training import screen
+from muvo_jax import command_line, late
+
+with late.imports():
+    from muvo_jax.data import records, shards
+    from muvo_jax.training import screen
 
 _EXAMPLES = """
 python -m muvo_jax.pack ~/recordings/town ~/packed/town

@@ -17,6 +17,7 @@ ALLOWED = {
     "config_heads": set(),
     "config_json": set(),
     "geometry": set(),
+    "late": set(),
     "config": {"config_augmentation", "config_heads", "config_json", "geometry"},
     "presets": {"config"},
     "ops": {"types", "config", "geometry"},
@@ -27,7 +28,7 @@ ALLOWED = {
     "agents": BASE | {"nn", "model", "metrics"},
     "data": BASE,
     "viz": BASE,
-    "interop": BASE | {"nn", "model", "objectives", "metrics", "data", "training", "command_line"},
+    "interop": BASE | {"nn", "model", "objectives", "metrics", "data", "training", "command_line", "late"},
     "training": BASE | {"nn", "model", "objectives", "metrics", "data"},
 }
 

@@ -17,6 +17,7 @@ from muvo_jax.ops import voxels
 _WINDOW_FRAMES = 23
 _MOVING_MPS, _TURNING_RADPS = 1.0, 0.02
 _FEWEST_SAMPLES = 30
+_MISALIGNED_RAD = math.radians(1.0)  # less is no problem, nor is what the lidar's beams cannot tell
 _OPPOSED, _TOGETHER = -0.5, 0.5  # correlations
 
 
@@ -212,11 +213,14 @@ def of_alignment(fit: alignment_lib.Alignment, recording: schema.Recording) -> l
         return [Finding("remark", "whether lidar and camera agree could not be measured (too few clear edges); look at "
                                   "the overlay.")]
     focal_px = described.camera.intrinsics[0][0]
-    shift_rad = math.hypot(fit.right_px, fit.down_px) / focal_px
-    limit_rad = max(math.radians(1.0), 1.5 * 2 * math.pi / described.lidar.columns)
-    place = (f"{fit.right_px:+.0f} px to the right and {fit.down_px:+.0f} px down ({math.degrees(shift_rad):.1f} "
-             f"degrees)")
-    if shift_rad > limit_rad and fit.gain > 1.03:
+    degrees = math.degrees(math.atan(math.hypot(fit.right_px, fit.down_px) / focal_px))
+    place = f"{fit.right_px:+.0f} px to the right and {fit.down_px:+.0f} px down ({degrees:.1f} degrees)"
+    least_px = focal_px * math.tan(_MISALIGNED_RAD)
+    beams = math.hypot(fit.right_px / max(least_px, 1.5 * fit.column_px), fit.down_px / max(least_px, 1.5 * fit.row_px))
+    if beams > 1 and fit.gain > 1.03:
+        first = "the rotation in camera_to_ego" if fit.is_turn else "intrinsics and camera_to_ego"
         return [Finding("problem", f"lidar and camera are misaligned: the scan fits the picture best when moved by "
-                                   f"{place}. Check camera_to_ego, intrinsics and the time of both.")]
-    return [Finding("remark", f"lidar and camera agree: best fit when moved by {place}.")]
+                                   f"{place}. Check {first}, and the time of both.")]
+    row_degrees = math.degrees(math.atan(fit.row_px / focal_px))
+    return [Finding("remark", f"lidar and camera agree: best fit when moved by {place}, where rows of the lidar are "
+                              f"{row_degrees:.1f} degrees apart.")]

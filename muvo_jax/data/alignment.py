@@ -117,7 +117,7 @@ def measure(frames: Iterable[schema.RawFrame], lidar: config_lib.RangeViewGeomet
     draws = [_best(stack[rng.integers(len(stack), size=len(stack)), kind].sum(axis=0)) for _ in range(_DRAWS)]
     spread = np.quantile(np.abs(np.array(draws) - [down, right]), 0.8, axis=0) / scale
     return Alignment(
-        float((right - reach) / scale), float((down - reach) / scale),
+        (right + _summit(total[down], right) - reach) / scale, (down + _summit(total[:, right], down) - reach) / scale,
         float(total[down, right] / max(total[reach, reach], 1e-9)), float(contrast[kind]), edges, bool(kind),
         look.row_rad * focal_px, look.column_rad * focal_px, (float(spread[1]), float(spread[0])),
         down in (0, 2 * reach) or right in (0, 2 * reach))
@@ -135,6 +135,15 @@ def _look(frame: schema.RawFrame, gaps: Gaps) -> _Look:
 def _best(fit: np.ndarray) -> tuple[int, int]:
     down, right = np.unravel_index(int(fit.argmax()), fit.shape)
     return int(down), int(right)
+
+
+def _summit(fits: np.ndarray, best: int) -> float:
+    """How far beside the best of some values the top of the parabola through it and its neighbours lies."""
+    if not 0 < best < len(fits) - 1:
+        return 0.0
+    before, here, after = map(float, fits[best - 1:best + 2])
+    bend = before - 2 * here + after
+    return 0.5 * (before - after) / bend if bend < 0 else 0.0
 
 
 def _filled(lidar: config_lib.RangeViewGeometry, points: int) -> config_lib.RangeViewGeometry:

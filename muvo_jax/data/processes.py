@@ -14,6 +14,11 @@ except ImportError:  # Windows: there it is up to the user not to work on one fo
     fcntl = None  # type: ignore[assignment]
 
 
+def processors() -> int:
+    """How many processors this process may use: what a number of workers is where none is asked for."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
 def stream(work: Callable[..., Iterable], shares: Sequence[tuple], doing: str) -> Iterator:
     """Runs `work(*share)` in a process for each share; yields what they yield, as it comes.
 

@@ -163,6 +163,10 @@ def gap_free(present: np.ndarray, breaks: np.ndarray) -> list[tuple[int, int]]:
     return pieces
 
 
+class GapWarning(schema.DataWarning):
+    """A few frames that a sensor lacks, or jumps in time: sequences are cut there, and the rest is whole."""
+
+
 def warn_of_gaps(where: str, present: np.ndarray, absent: dict[str, int], late: np.ndarray, pieces: int) -> None:
     """Warns, with counts, of frames that a sensor lacks and of gaps in time; says nothing where there are none.
 
@@ -184,4 +188,4 @@ def warn_of_gaps(where: str, present: np.ndarray, absent: dict[str, int], late: 
         few = max(int((~present).sum()), int(late.sum())) <= max(1, FEW_SHARE * len(present))
         left = words.counted(pieces, "gap-free sequence")
         warnings.warn(f"{where}: {' and '.join(found)}; what is left makes {left}.",
-                      schema.GapWarning if few else schema.DataWarning, stacklevel=4)
+                      GapWarning if few else schema.DataWarning, stacklevel=4)

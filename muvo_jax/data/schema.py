@@ -28,10 +28,6 @@ class DataWarning(UserWarning):
     """Recorded data that can be used in part; the message counts what is left out."""
 
 
-class GapWarning(DataWarning):
-    """Frames that a sensor lacks or jumps in time, where sequences are cut; the others are whole."""
-
-
 class RawFrame(TypedDict, total=False):
     """One frame as recorded. A modality that the recording lacks has no key.
 

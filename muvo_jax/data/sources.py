@@ -41,6 +41,9 @@ KINDS = (
 )
 
 
+_ARCHIVES = (".zip", ".tar", ".tgz", ".gz", ".xz", ".bz2", ".zst", ".7z", ".rar")
+
+
 def recognise(path: pathlib.Path | str, *, camera: str = "") -> Kind:
     """What kind of recording a folder is, without opening it.
 
@@ -50,9 +53,15 @@ def recognise(path: pathlib.Path | str, *, camera: str = "") -> Kind:
     """
     path = pathlib.Path(path).expanduser()
     known = "; ".join(f"{kind.name} ({kind.layout})" for kind in KINDS)
+    if str(path) == "town" and not path.exists():
+        raise schema.DataError("\"town\" names the built-in world, which python -m muvo_jax.train --data=town records "
+                               "first; here give the folder of a recording, such as that in ~/.cache/muvo_jax.")
     if not path.exists():
         raise schema.DataError(f"data folder {path} does not exist. Expected a recording: {known}; or \"town\", the "
                                f"built-in world.")
+    if path.is_file() and path.name.lower().endswith(_ARCHIVES):
+        raise schema.DataError(f"{path} is an archive: unpack it and give the folder that comes out. Expected a "
+                               f"recording: {known}.")
     if not path.is_dir():
         raise schema.DataError(f"{path} is a file; expected the folder of a recording: {known}.")
     if not any(path.iterdir()):

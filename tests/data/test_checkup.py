@@ -179,3 +179,40 @@ def test_stretches_are_spread_and_limited(tmp_path):
     result = checkup.examine(recording, frames=120)
     assert result.facts["read"] == "65 of 65 frames looked at"
     assert set(result.motion.stretch) == {0, 1}
+
+
+def driven(**changes):
+    """The drive with the poses that its speed and yaw rate lead to."""
+    motion = drive()
+    yaw_rad = np.cumsum(np.append(0, motion.yaw_rate_radps[:-1] * 0.1))
+    step_m = motion.speed_mps[:, None] * np.stack([np.cos(yaw_rad), np.sin(yaw_rad)], axis=1) * 0.1
+    place_m = np.cumsum(np.concatenate([np.zeros((1, 2)), step_m[:-1]]), axis=0)
+    return dataclasses.replace(motion, pose=np.column_stack([place_m, yaw_rad]), **changes)
+
+
+@pytest.mark.parametrize(("change", "message"), [
+    (lambda motion: {}, None),
+    (lambda motion: {"speed_mps": motion.speed_mps * 3.6}, r"speed_mps is 3\.\d+ times .*km/h"),
+    (lambda motion: {"pose": motion.pose * [1000, 1000, 1]}, r"speed_mps is 0\.00 times .*km/s"),
+    (lambda motion: {"pose": motion.pose * [1, 1, 57.2958]}, "must be in radians"),
+])
+def test_units_are_compared_with_the_motion(change, message):
+    motion = driven()
+    found = judgements.of_units(dataclasses.replace(motion, **change(motion)))
+    assert len(found) == (message is not None)
+    assert all(re.search(message, finding.text) and finding.level == "problem" for finding in found)
+
+
+def test_points_in_centimetres_are_found(tmp_path):
+    root = writers.write_plain(tmp_path / "rec")
+    for path in root.glob("*/*/lidar/*.npz"):
+        np.savez(path, points_m=np.random.default_rng(0).uniform(-4000, 4000, (100, 3)).astype(np.float32))
+    texts = [finding.text for finding in checkup.examine(plain.PlainRecording(root)).findings]
+    assert any("are they in metres?" in text for text in texts)
+
+
+def test_nothing_to_look_at_is_a_problem(tmp_path):
+    described = plain.PlainRecording(writers.write_plain(tmp_path / "rec")).description
+    empty = types.SimpleNamespace(sequences=(), description=described)
+    assert any("not one frame" in finding.text and finding.level == "problem"
+               for finding in checkup.examine(empty).findings)

@@ -36,8 +36,8 @@ class Options:
     hit counts as empty."""
     overwrite: bool = False
     """Remove the files that are there and make all anew; otherwise they are kept."""
-    workers: Annotated[int | None, command_line.shown("INT", "one a processor")] = None
-    """Number of processes."""
+    workers: Annotated[int | None, command_line.shown("N", "one a processor")] = None
+    """How many frames are made side by side, each by a process."""
 
 
 def voxelize(options: Options, show: screen.Screen) -> None:

@@ -7,7 +7,7 @@ from collections.abc import Callable, Collection
 from typing import Any, NamedTuple
 
 from muvo_jax import config as config_lib
-from muvo_jax.data import carla, carla_runs, files, kitti, plain, prepare, records, schema
+from muvo_jax.data import carla, carla_runs, files, kitti, manifest, plain, prepare, records, schema
 from muvo_jax.data.town import record
 
 
@@ -30,8 +30,8 @@ class Kind(NamedTuple):
 
 
 KINDS = (
-    Kind("packed", f"a folder of shards with {records.MANIFEST_FILE}",
-         lambda path: (path / records.MANIFEST_FILE).is_file(), records.PackedRecording),
+    Kind("packed", f"a folder of shards with {manifest.MANIFEST_FILE}",
+         lambda path: (path / manifest.MANIFEST_FILE).is_file(), records.PackedRecording),
     Kind("plain", f"a folder with {plain.DESCRIPTION_FILE}",
          lambda path: (path / plain.DESCRIPTION_FILE).is_file(), plain.PlainRecording),
     Kind("KITTI raw", "<date>/<date>_drive_NNNN_sync folders, or one of them",
@@ -92,9 +92,9 @@ def open_recording(path: pathlib.Path | str, *, camera: str = "", skip_corrupt_s
     path = pathlib.Path(path).expanduser()
     kind = recognise(path, camera=camera)
     if kind.open is records.PackedRecording and skip_corrupt_shards:
-        return records.PackedRecording(path, corrupt="skip")
+        return records.PackedRecording(path, corrupt="skip", labels=labels)
     options: dict[str, Any] = {"camera": camera} if camera else {}
-    if kind.open in (plain.PlainRecording, carla.CarlaRecording):
+    if kind.open in (plain.PlainRecording, carla.CarlaRecording, records.PackedRecording):
         options["labels"] = frozenset(labels)
     return kind.open(path, **options)
 

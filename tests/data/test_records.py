@@ -225,8 +225,8 @@ def test_labels_are_packed_and_left_out_where_nobody_asks(source, tmp_path):
     assert "depth_m" not in without.description.modalities | frames_of(without)[0].keys()
 
 
-_LEAVES = st.sampled_from([None, True, -1, 0, 3, 2**63, 10**30, 1.5, float("nan"), "", "../x", "shard-00000.arrayrecord",
-                           [], [[]], {}, {"a": 1}])
+_LEAVES = st.sampled_from([None, True, -1, 0, 3, 2**63, 10**30, 1.5, float("nan"), "", "../x", [], [[]], {}, {"a": 1},
+                           "shard-00000.arrayrecord"])
 
 
 @settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])

@@ -29,12 +29,14 @@ with late.imports():
 
     from muvo_jax import config as config_lib
     from muvo_jax import types
+    from muvo_jax.interop import safetensors_file
     from muvo_jax.model import live as live_lib
     from muvo_jax.model import rollout, world_model
     from muvo_jax.training import screen
 
 PLATFORMS = ("cpu", "cuda")
 SIGNATURES = "signatures.json"
+WEIGHTS = "weights.safetensors"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -66,9 +68,8 @@ def export(options: Options, show: screen.Screen) -> list[pathlib.Path]:
     Raises:
       ValueError: if OUT holds something, the horizon is below 1, or a library of the extra is missing.
     """
-    for library in ("flatbuffers", "safetensors"):
-        if importlib.util.find_spec(library) is None:
-            raise ValueError(f"export needs {library}: pip install 'muvo_jax[export]'")
+    if importlib.util.find_spec("flatbuffers") is None:
+        raise ValueError("export needs flatbuffers: pip install 'muvo_jax[export]'")
     if options.out.exists() and any(options.out.iterdir()):
         raise ValueError(f"OUT: {options.out} is not empty; name a new folder.")
     loaded = command_line.load_run(options.run, options.checkpoint, show)
@@ -86,8 +87,6 @@ def seal(model: world_model.WorldModel, variables: types.Variables, config: conf
     Raises:
       ValueError: for a horizon below 1.
     """
-    import safetensors.numpy
-
     if horizon < 1:
         raise ValueError(f"horizon is {horizon}; it must be at least 1.")
     out.mkdir(parents=True, exist_ok=True)
@@ -100,7 +99,6 @@ def seal(model: world_model.WorldModel, variables: types.Variables, config: conf
         contents[f"{name}.bin"] = bytes(exported.serialize())
         signatures[name] = {"arguments": [_describe(argument) for argument in arguments[1:]],
                             "result": _describe(jax.tree.unflatten(exported.out_tree, exported.out_avals))}
-    contents["weights.safetensors"] = safetensors.numpy.save(weights)
     contents["config.json"] = json.dumps(config.to_dict(), indent=2).encode()
     contents["contract.json"] = json.dumps(
         {**dataclasses.asdict(config.contract), "stride": config.data.stride}, indent=2).encode()
@@ -109,7 +107,8 @@ def seal(model: world_model.WorldModel, variables: types.Variables, config: conf
                                       indent=2).encode()
     for name, content in contents.items():
         (out / name).write_bytes(content)
-    return [out / name for name in contents]
+    safetensors_file.save(out / WEIGHTS, weights)
+    return [*(out / name for name in contents), out / WEIGHTS]
 
 
 def functions(model: world_model.WorldModel, weights: Mapping[str, Any], config: config_lib.Config,

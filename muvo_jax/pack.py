@@ -35,6 +35,8 @@ class Options:
     """The folder for the shards; read it as any other recording."""
     camera: Annotated[str, command_line.shown("NAME", "the reader's choice")] = ""
     """Which camera, where the recording has several (KITTI: image_00 to image_03)."""
+    labels: bool = True
+    """Pack depth, classes and other labels too, as far as they are recorded."""
     jpeg_quality: Annotated[int | None, command_line.shown("N", "PNG")] = None
     """Of images, 1 to 95; without it nothing is lost."""
     half_points: bool = False
@@ -55,8 +57,8 @@ def pack(options: Options, show: screen.Screen) -> None:
     with show.counter("packing", "frames") as progress:
         complete = shards.pack(
             options.source, options.out, frames_per_shard=options.frames_per_shard, camera=options.camera,
-            encoding=records.Encoding(options.jpeg_quality, options.half_points), machine=options.machine,
-            machines=options.machines, workers=options.workers, progress=progress)
+            labels=options.labels, encoding=records.Encoding(options.jpeg_quality, options.half_points),
+            machine=options.machine, machines=options.machines, workers=options.workers, progress=progress)
     seconds = time.perf_counter() - start_s
     if not complete:
         show.line(f"this machine's shards are complete after {seconds:.1f} s; {manifest.MANIFEST_FILE} is written once "

@@ -36,12 +36,13 @@ class Shard(NamedTuple):
 
 
 def pack(source: pathlib.Path | str, out: pathlib.Path | str, *, encoding: records.Encoding | None = None,
-         frames_per_shard: int = manifest.FRAMES_PER_SHARD, camera: str = "", machine: int = 0, machines: int = 1,
-         workers: int | None = None, progress: Progress | None = None) -> bool:
-    """Packs a recording of any kind with all its labels; shards that are complete already are kept.
+         frames_per_shard: int = manifest.FRAMES_PER_SHARD, camera: str = "", labels: bool = True, machine: int = 0,
+         machines: int = 1, workers: int | None = None, progress: Progress | None = None) -> bool:
+    """Packs a recording of any kind; shards that are complete already are kept.
 
     Args:
       camera: which one, where the source has several; by default its reader's choice.
+      labels: whether to pack what schema.LABELS names, too, as far as it is recorded.
       machine, machines: this call writes the shards whose number is `machine` modulo `machines`.
       workers: how many shards are packed side by side, by default one for each processor.
       progress: called with (frames done, frames in all of this machine).
@@ -62,7 +63,7 @@ def pack(source: pathlib.Path | str, out: pathlib.Path | str, *, encoding: recor
     encoding = encoding or records.Encoding()
     source, out = pathlib.Path(source).expanduser(), pathlib.Path(out).expanduser()
     _check_apart(source, out)
-    recording = sources.open_recording(source, camera=camera, labels=schema.LABELS)
+    recording = sources.open_recording(source, camera=camera, labels=schema.LABELS if labels else ())
     plan = _plan(recording, frames_per_shard, encoding)
     out.mkdir(parents=True, exist_ok=True)
     with processes.locked(out / f".packing-{machine}-of-{machines}", "packing"):

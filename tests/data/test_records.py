@@ -221,6 +221,8 @@ def test_labels_are_packed_and_left_out_where_nobody_asks(source, tmp_path):
     assert with_labels.description.modalities == expected.description.modalities >= {"depth_m"}
     for left, right in zip(frames_of(expected), frames_of(with_labels), strict=True):
         assert_same(left, right)
+    assert shards.pack(recording, tmp_path / "without", labels=False, workers=1)
+    assert "depth_m" not in sources.open_recording(tmp_path / "without", labels=schema.LABELS).description.modalities
     without = sources.open_recording(tmp_path / "out")
     assert "depth_m" not in without.description.modalities | frames_of(without)[0].keys()
 

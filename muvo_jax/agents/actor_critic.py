@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from typing import Any
+from typing import Annotated, Any
 
 import flax.struct
 import jax
@@ -19,6 +19,7 @@ import optax
 from flax import linen
 
 from muvo_jax.agents import environment as environment_lib
+from muvo_jax.limits import COUNT, NOT_NEGATIVE, SHARE, above, check
 from muvo_jax.types import Array
 
 
@@ -32,17 +33,20 @@ class ActorCriticConfig:
       target_rate: of the exponential average that gives bootstrap values.
     """
 
-    starts: int = 64
-    horizon: int = 12
-    width: int = 128
-    layers: int = 2
-    discount: float = 0.98
-    lambda_: float = 0.95
-    entropy: float = 3e-3
-    learning_rate: float = 3e-4
-    clip_norm: float = 100.0
-    target_rate: float = 0.02
-    scale_rate: float = 0.01
+    starts: Annotated[int, COUNT] = 64
+    horizon: Annotated[int, COUNT] = 12
+    width: Annotated[int, COUNT] = 128
+    layers: Annotated[int, COUNT] = 2
+    discount: Annotated[float, SHARE] = 0.98
+    lambda_: Annotated[float, SHARE] = 0.95
+    entropy: Annotated[float, NOT_NEGATIVE] = 3e-3
+    learning_rate: Annotated[float, above(0)] = 3e-4
+    clip_norm: Annotated[float, above(0)] = 100.0
+    target_rate: Annotated[float, SHARE] = 0.02
+    scale_rate: Annotated[float, SHARE] = 0.01
+
+    def __post_init__(self):
+        check(self)
 
 
 @flax.struct.dataclass

@@ -293,8 +293,12 @@ def play(environment: Environment, params: EnvParams, key: Array, state: EnvStat
 def make(model: WorldModel, config: config_lib.Config, *, learned_reward: bool = False, **options: Any) -> Environment:
     """The environment of a run: contract and stride come from its config; options as in Environment.
 
-    `learned_reward` takes reward and ends from the heads reward and continue (rewards.learned_reward).
+    `learned_reward` takes reward and ends from the heads reward and continue (rewards.learned_reward). The driving
+    reward reads the route map at the recording's scale where reward_config does not say another one.
     """
+    settings = options.get("reward_config", rewards.RewardConfig())
+    if settings.route == config_lib.RouteMap():
+        options["reward_config"] = dataclasses.replace(settings, route=config.data.route_map)
     if learned_reward:
         options |= {"reward_function": rewards.learned_reward, "reward_heads": rewards.LEARNED_HEADS}
     return Environment(model, contract=config.contract, periods=config.data.stride, **options)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable
+from typing import Annotated
 
 import flax.struct
 import jax
@@ -15,6 +16,7 @@ import jax.numpy as jnp
 import optax
 
 from muvo_jax.agents import environment as environment_lib
+from muvo_jax.limits import COUNT, NOT_NEGATIVE, SHARE, above, check
 from muvo_jax.types import Array
 
 Objective = Callable[[Array, Array], Array]
@@ -36,21 +38,21 @@ class PlannerConfig:
       learning_rate: of gradient planning (Adam).
     """
 
-    plans: int = 64
-    iterations: int = 4
-    elites: int = 8
-    kept: int = 3
-    noise_exponent: float = 2.0
-    std: float = 0.5
-    smoothing: float = 0.1
-    temperature: float = 0.5
-    learning_rate: float = 0.1
+    plans: Annotated[int, COUNT] = 64
+    iterations: Annotated[int, COUNT] = 4
+    elites: Annotated[int, COUNT] = 8
+    kept: Annotated[int, NOT_NEGATIVE] = 3
+    noise_exponent: Annotated[float, NOT_NEGATIVE] = 2.0
+    std: Annotated[float, above(0)] = 0.5
+    smoothing: Annotated[float, SHARE] = 0.1
+    temperature: Annotated[float, above(0)] = 0.5
+    learning_rate: Annotated[float, above(0)] = 0.1
 
     def __post_init__(self):
-        if not 0 <= self.kept <= self.elites <= self.plans or self.elites < 1 or self.iterations < 1:
-            raise ValueError(f"PlannerConfig: expected 0 <= kept <= elites <= plans, at least one elite and one "
-                             f"iteration; got kept={self.kept}, elites={self.elites}, plans={self.plans}, "
-                             f"iterations={self.iterations}.")
+        check(self)
+        if not self.kept <= self.elites <= self.plans:
+            raise ValueError(f"PlannerConfig: expected kept <= elites <= plans; got kept={self.kept}, "
+                             f"elites={self.elites}, plans={self.plans}.")
 
 
 @flax.struct.dataclass

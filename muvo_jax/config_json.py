@@ -36,7 +36,7 @@ def parse(cls, values: dict[str, Any], path: str):
     try:
         return cls(**fields)
     except RangeError as error:
-        raise ValueError(f"{path}.{error.field} {error.problem}") from error
+        raise ValueError(f"{path}.{error.field}{error.problem}") from error
 
 
 def override(config, dotted: str, value: Any):

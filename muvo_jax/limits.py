@@ -77,12 +77,12 @@ class RangeError(ValueError):
 
     Attributes:
       field: its name in its dataclass.
-      problem: the rest of the sentence.
+      problem: the rest of the sentence, after the name.
     """
 
     def __init__(self, owner: str, field: str, problem: str):
-        super().__init__(f"{owner}.{field} {problem}")
-        self.field, self.problem = field, problem
+        self.field, self.problem = field, problem if problem.startswith(":") else f" {problem}"
+        super().__init__(f"{owner}.{field}{self.problem}")
 
 
 def check(instance: Any) -> None:

@@ -62,7 +62,7 @@ def test_no_number_of_the_settings_may_be_what_it_cannot_be(section, name, whole
     now = getattr(getattr(config, section), name)
     if now == ():
         now = (1.0,)
-    like = lambda value: tuple(map(lambda _: value, now)) if isinstance(now, tuple) else value
+    like = lambda value: (value,) * len(now) if isinstance(now, tuple) else value
     wrong = [like("much"), like(True)]
     wrong += [] if whole else [like(math.nan), like(math.inf), like(-math.inf)]
     if math.isfinite(limit.lowest):

@@ -118,7 +118,7 @@ def conform(name: str, values: Any, where: str, shape: tuple[int | None, ...] | 
                         f"{['any' if size is None else size for size in wanted]}. Do not mix recordings of different "
                         f"settings in one folder.")
     whole = np.issubdtype(field.dtype, np.integer) or field.dtype is np.bool_
-    if array.dtype.kind not in ("biu" if whole else "f" if array.ndim else "fiu"):
+    if array.dtype.kind not in ("biu" if whole else "f" if field.folder else "fiu"):
         raise DataError(f"{where}: {name} holds {array.dtype}, expected {np.dtype(field.dtype).name}"
                         f"{f' in {field.unit}' if field.unit else ''}. Write it with that type and unit.")
     _check_range(field, array, where)

@@ -33,7 +33,7 @@ def read(path: pathlib.Path) -> dict[str, np.ndarray]:
         if field.required or any(cells):
             where = [f"{path}, line {line}: {column}" for line in range(2, len(rows) + 2)]
             columns[column] = _frame_ids(cells, where) if column == "frame_id" else np.array(
-                [_number(text, field, place) for text, place in zip(cells, where, strict=True)], np.float64)
+                [number(text, field, place) for text, place in zip(cells, where, strict=True)], np.float64)
     files.check_increasing(columns["timestamp_s"], [f"{path}, line {line + 2}" for line in range(len(rows))])
     if "yaw_rad" in columns and "yaw_rate_radps" not in columns:
         columns["yaw_rate_radps"] = _rates(columns["yaw_rad"], columns["timestamp_s"])
@@ -90,7 +90,8 @@ def _whole_float(text: str) -> int:
     return int(value) if math.isfinite(value) and value.is_integer() and abs(value) < 2**53 else -1
 
 
-def _number(text: str, field: fields.Field, where: str) -> float:
+def number(text: str, field: fields.Field, where: str) -> float:
+    """A cell as a number; a blank is_terminal is 0. Raises DataError where the field cannot have it."""
     if not text and field.name == "is_terminal":
         return 0.0
     try:

@@ -86,8 +86,9 @@ def train(job: Job, show: screen.Screen) -> Outcome:
         config, recording, making_s = _open_data(job, show)
         frames = pipeline.Frames(recording, config)
         source = pipeline.train_batches(frames, seed=config.train.seed, batch=windows_per_step(config))
-        shapes = preparation.expected_batch(config, windows_per_step(config),
-                                            rewards="reward" in recording.description.modalities)
+        there = schema.in_every_frame(recording)
+        shapes = preparation.expected_batch(config, windows_per_step(config), rewards="reward" in there,
+                                            ends="is_terminal" in there)
         ready = early.result()
         ready = (preparation.recompile(ready, config, shapes, job.frozen) if ready
                  else preparation.prepare(config, shapes, job.frozen))

@@ -53,12 +53,13 @@ class Prepared:
         return parallel_lib.place_state(self.step.plan, state)
 
 
-def expected_batch(config: config_lib.Config, windows: int, *, rewards: bool = True) -> types.Batch:
+def expected_batch(config: config_lib.Config, windows: int, *, rewards: bool = True,
+                   ends: bool | None = None) -> types.Batch:
     """The shapes of a batch of `windows` training windows, as jax.ShapeDtypeStruct leaves.
 
     Args:
       config: adapted to the data, or a preset of the built-in town.
-      rewards: whether the recording holds reward and is_terminal.
+      rewards, ends: whether every frame has reward and is_terminal; `ends` None is as `rewards`.
     """
     model, prefix = config.model, (windows, config.data.frames)
 
@@ -74,8 +75,8 @@ def expected_batch(config: config_lib.Config, windows: int, *, rewards: bool = T
     if model.camera != config_lib.NO_SENSOR or "image" in config.targets:
         fields |= {"intrinsics": shape(np.float32, 3, 3), "camera_to_ego": shape(np.float32, 4, 4)}
     fields |= {name: timed(types.BATCH_FIELDS[name][0], *sizes) for name, sizes in config.targets.items()}
-    if rewards:
-        fields |= {"reward": timed(np.float32), "is_terminal": timed(np.bool_)}
+    recorded = {"reward": rewards, "is_terminal": rewards if ends is None else ends}
+    fields |= {name: timed(types.BATCH_FIELDS[name][0]) for name, there in recorded.items() if there}
     fields["action"] = timed(np.float32, 2)
     return types.Batch(is_first=timed(np.bool_), **fields)
 

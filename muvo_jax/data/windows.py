@@ -37,7 +37,8 @@ def find_windows(recording: schema.Recording, split: str, *, frames: int, stride
     if split not in recording.description.splits:
         raise schema.DataError(f"recording {recording.description.name!r} has no split {split!r}; it has "
                                f"{', '.join(recording.description.splits)}.")
-    found = tuple(Window(sequence, start, frames, stride) for sequence in recording.sequences if sequence.split == split and sequence.has(needs)
+    found = tuple(Window(sequence, start, frames, stride) for sequence in recording.sequences
+                  if sequence.split == split and sequence.has(needs)
                   for start in range(sequence.length - prepare.span(frames, stride) + 1))
     if not found:
         raise prepare.too_short(recording, split, frames, stride, needs)

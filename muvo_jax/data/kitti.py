@@ -26,7 +26,7 @@ import numpy as np
 
 from muvo_jax import config as config_lib
 from muvo_jax.data import files, schema
-from muvo_jax.data.kitti_files import LIDAR_HEIGHT_M, lines, read_camera, read_oxts, read_pose, read_scan
+from muvo_jax.data.kitti_files import LIDAR_HEIGHT_M, read_camera, read_oxts, read_pose, read_scan, text_lines
 
 __all__ = ["CAMERAS", "CONTRACT", "LIDAR", "LIDAR_HEIGHT_M", "KittiRecording", "derive_action", "find_drives",
            "read_camera", "read_oxts", "read_pose", "read_scan"]
@@ -218,7 +218,7 @@ def _read_timestamps(path: pathlib.Path, frame_ids: np.ndarray, present: np.ndar
     """Seconds of each frame, NaN where not present; line n of the file (from 0) is frame n."""
     if not path.is_file():
         raise files.missing(path, f"the time stamps of {path.parent.name}")
-    stamps = lines(path)
+    stamps = text_lines(path)
     times_s = np.full(len(frame_ids), np.nan)
     for frame_id in frame_ids[present].tolist():
         try:

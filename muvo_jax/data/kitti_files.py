@@ -26,8 +26,6 @@ _OXTS_LIMITS = {_LATITUDE: ("latitude", between(-90, 90, "degrees")), _LONGITUDE
                 _YAW_RATE: ("angular rate about the up axis", between(-20, 20, "rad/s"))}
 _REFLECTANCE_SHARE = 0.01  # more of it outside [0, 1] is no reflectance
 
-
-
 def read_scan(path: pathlib.Path) -> np.ndarray:
     """Returns one velodyne scan as points float32 [N, 3] in the ego frame (reflectance is not used).
 
@@ -124,7 +122,7 @@ def read_camera(date_folder: pathlib.Path, number: str) -> schema.Camera:
                                f"{error}") from error
 
 
-def lines(path: pathlib.Path) -> list[str]:
+def text_lines(path: pathlib.Path) -> list[str]:
     try:
         return path.read_text(encoding="utf-8-sig").splitlines()
     except UnicodeDecodeError as error:
@@ -138,7 +136,7 @@ def _rigid(rotation: np.ndarray, translation: np.ndarray) -> np.ndarray:
 def _read_calibration(path: pathlib.Path, sizes: dict[str, int]) -> dict[str, np.ndarray]:
     if not path.is_file():
         raise files.missing(path, "the calibration of this date (KITTI offers it as a separate download)")
-    lines = dict(line.split(":", 1) for line in lines(path) if ":" in line)
+    lines = dict(line.split(":", 1) for line in text_lines(path) if ":" in line)
     values = {}
     for key, size in sizes.items():
         try:

@@ -40,6 +40,12 @@ def read(path: pathlib.Path) -> dict[str, np.ndarray]:
     return columns
 
 
+def words(path: pathlib.Path, column: str) -> list[str]:
+    """A column of text; empty where there is none. Raises DataError for a malformed table."""
+    header, rows = _cells(path)
+    return [row[header.index(column)] for row in rows] if column in header else []
+
+
 def _cells(path: pathlib.Path) -> tuple[list[str], list[list[str]]]:
     """Header and rows, without blanks around cells and without empty lines."""
     try:

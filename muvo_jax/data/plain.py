@@ -90,6 +90,7 @@ class PlainRecording:
         every = read_runs(root, splits)
         rate_hz = description.rate_hz(header, toml_path)
         self._class_names = _class_names(header, toml_path)
+        self.stated_classes = self._class_names if "classes" in header else ()
         self._wanted = [field for field in fields.TABLE
                         if field.folder and (not field.is_label or field.name in labels)]
         self._files = {run.name: _files_of(run, self._wanted) for run in every}
@@ -131,6 +132,12 @@ class PlainRecording:
     def action(self, sequence: schema.Sequence, index: int) -> np.ndarray:
         """See schema.Recording."""
         return self._of_table(self._runs[sequence.name], "action", sequence.start + index)
+
+    def words(self, sequence: schema.Sequence, column: str) -> list[str]:
+        """A column of text of frames.csv, such as weather, for the frames of a sequence; empty where there is none."""
+        run = self._runs[sequence.name]
+        found = frames_table.words(run.folder / FRAMES_FILE, column)
+        return found[sequence.start:sequence.start + sequence.length]
 
     def path(self, sequence: schema.Sequence, index: int, name: str) -> pathlib.Path:
         """The file that a field of a frame is read from; where there is none, as the writer would name it."""

@@ -136,13 +136,13 @@ def policy(config: ActorCriticConfig, actor: Any, *, sampled: bool = True) -> ja
 
 def _act(config, sampled, actor, key, observation):
     mean, std = _moments(config, actor, observation)
-    return jnp.tanh(mean + std * jax.random.normal(key, mean.shape) if sampled else mean)
+    return jnp.tanh(mean + std * jax.random.normal(key, mean.shape, jnp.float32) if sampled else mean)
 
 
 def init(key: Array, environment: environment_lib.Environment, config: ActorCriticConfig) -> Learner:
     """A fresh learner for observations that are one vector."""
     key_actor, key_critic = jax.random.split(key)
-    observation = jnp.zeros((environment.model.policy_feature_channels,))
+    observation = jnp.zeros((environment.model.policy_feature_channels,), jnp.float32)
     actor, critic = _actor(config).init(key_actor, observation), _critic(config).init(key_critic, observation)
     return Learner(actor, critic, critic, jnp.float32(1.0), _optimizer(config).init((actor, critic)), jnp.int32(0))
 
@@ -160,7 +160,7 @@ def imagine(environment, config, params, key, actor):
         observation, state = carry
         key_action, key_step = jax.random.split(key)
         mean, std = _moments(config, actor, observation)
-        drawn = mean + std * jax.random.normal(key_action, mean.shape)
+        drawn = mean + std * jax.random.normal(key_action, mean.shape, jnp.float32)
         keys = jax.random.split(key_step, config.starts)
         state, transition = jax.vmap(environment.step, (0, 0, 0, None))(keys, state, jnp.tanh(drawn), params)
         return (transition.observation, state), (observation, drawn, transition)

@@ -17,7 +17,7 @@ import jax
 import jax.numpy as jnp
 
 from muvo_jax import config as config_lib
-from muvo_jax.agents import kinematics, rewards
+from muvo_jax.agents import forks, kinematics, rewards
 from muvo_jax.model import checks
 from muvo_jax.model.world_model import WorldModel
 from muvo_jax.types import Array, Batch, LatentState, Observed, Variables
@@ -179,11 +179,14 @@ class Environment:
             raise ValueError(f"StartBank: got states {list(lead)} and speeds {list(bank.speed_mps.shape)}; expected "
                              f"both [M] with M at least 1.")
         checks.counts(horizon, None)
+        checks.finite("StartBank", latent=bank.latent, speed_mps=bank.speed_mps)
+        checks.finite("params", temperature=temperature)
         return EnvParams(jax.tree.map(jnp.asarray, variables), bank, jnp.int32(horizon), jnp.float32(temperature))
 
     def reset(self, key: Array, params: EnvParams) -> tuple[Any, EnvState]:
         """Draws a start from the bank: (observation, state)."""
-        start = jax.random.randint(key, (), 0, params.bank.size)
+        forks.check("Environment.reset")
+        start = jax.random.randint(key, (), 0, params.bank.size, jnp.int32)
         state = EnvState(params.bank.latent[start], kinematics.at_rest_of_frame(params.bank.speed_mps[start]),
                          start, jnp.int32(0), jnp.float32(0), jnp.bool_(False))
         return self.observe(state, params), state
@@ -196,8 +199,10 @@ class Environment:
 
     def step(self, key: Array, state: EnvState, action: Array, params: EnvParams) -> tuple[EnvState, Transition]:
         """One imagined step under action [2], clipped to [-1, 1]; see Transition. No auto-reset: `restart` does it."""
+        forks.check("Environment.step")
         action = self._checked(action)
-        noise = params.temperature * jax.random.normal(key, state.latent.stochastic.shape)
+        checks.forward_mode("Environment.step", self.model, params.variables, state, action)
+        noise = params.temperature * jax.random.normal(key, state.latent.stochastic.shape, jnp.float32)
         batched = jax.tree.map(lambda leaf: jnp.expand_dims(leaf, 0), (noise, action, state.latent))
         latent, _ = self.model.imagine_step(params.variables, *batched)
         latent = latent[0]
@@ -270,13 +275,29 @@ def bank_of(observed: Observed, batch: Batch, *, skip: int = 0) -> StartBank:
                      None if batch.route_map is None else merge(batch.route_map))
 
 
-@functools.partial(jax.jit, static_argnames=("environment", "horizon"))
 def play(environment: Environment, params: EnvParams, key: Array, state: EnvState, driver: Any,
          horizon: int) -> tuple[EnvState, Transition]:
     """Rolls one episode on: driver is actions [H, 2] or a jax.tree_util.Partial policy(key, observation) -> action.
 
     Returns the states and Transitions [H, ...]; nothing restarts.
+
+    Raises:
+      ValueError: for concrete actions that are not finite, outside [-1, 1] or of another shape, or a state that is not
+        finite.
+      TypeError: for forward-mode derivatives through convolutions that have none (ModelConfig.convolution).
     """
+    forks.check("play")
+    if not callable(driver):
+        if jnp.shape(driver) != (horizon, ACTION_CHANNELS):
+            raise ValueError(f"play: got actions {list(jnp.shape(driver))}, expected [{horizon}, 2].")
+        checks.action_values(driver, "play")
+    checks.finite("play", state=state)
+    checks.forward_mode("play", environment.model, params.variables, state, driver)
+    return _play(environment, params, key, state, driver, horizon)
+
+
+@functools.partial(jax.jit, static_argnames=("environment", "horizon"))
+def _play(environment, params, key, state, driver, horizon):
     def step(state, inputs):
         key, action = inputs
         key_policy, key_step = jax.random.split(key)

@@ -17,6 +17,7 @@ import optax
 
 from muvo_jax.agents import environment as environment_lib
 from muvo_jax.limits import COUNT, NOT_NEGATIVE, SHARE, above, check
+from muvo_jax.model import checks
 from muvo_jax.types import Array
 
 Objective = Callable[[Array, Array], Array]
@@ -68,6 +69,7 @@ def cem(objective: Objective, key: Array, start: Array, config: PlannerConfig = 
 
     Returns the best plan seen.
     """
+    start = _checked(start)
     horizon, channels = start.shape
 
     def iterate(carry, key):
@@ -83,16 +85,19 @@ def cem(objective: Objective, key: Array, start: Array, config: PlannerConfig = 
         return (blend(mean, elites.mean(axis=0)), blend(std, elites.std(axis=0)), elites, elite_values), None
 
     first = (jnp.clip(start, -1.0, 1.0), jnp.full_like(start, config.std),
-             jnp.zeros((config.elites, horizon, channels)), jnp.full((config.elites,), -jnp.inf))
+             jnp.zeros((config.elites, horizon, channels), jnp.float32),
+             jnp.full((config.elites,), -jnp.inf, jnp.float32))
     (_, _, elites, values), _ = jax.lax.scan(iterate, first, jax.random.split(key, config.iterations))
     return Plan(elites[0], values[0])
 
 
 def mppi(objective: Objective, key: Array, start: Array, config: PlannerConfig = PlannerConfig()) -> Plan:
     """Model-predictive path integral control: the mean of all plans, weighted by exp(return / temperature)."""
+    start = _checked(start)
+
     def iterate(mean, key):
         key_noise, key_value = jax.random.split(key)
-        noise = config.std * jax.random.normal(key_noise, (config.plans, *start.shape))
+        noise = config.std * jax.random.normal(key_noise, (config.plans, *start.shape), jnp.float32)
         plans = jnp.clip(mean[None] + noise, -1.0, 1.0).at[0].set(mean)
         values = _finite(objective(key_value, plans))
         weights = jax.nn.softmax(values / config.temperature)
@@ -104,6 +109,7 @@ def mppi(objective: Objective, key: Array, start: Array, config: PlannerConfig =
 
 def gradient(objective: Objective, key: Array, start: Array, config: PlannerConfig = PlannerConfig()) -> Plan:
     """Gradient ascent on the return through the world model, projected to [-1, 1]; returns the best plan seen."""
+    start = _checked(start)
     optimizer = optax.adam(config.learning_rate)
     value_and_gradient = jax.value_and_grad(lambda plan, key: objective(key, plan[None])[0])
 
@@ -123,6 +129,18 @@ def gradient(objective: Objective, key: Array, start: Array, config: PlannerConf
     return Plan(jnp.where(better, plan, best.actions), jnp.where(better, value, best.value))
 
 
+def _checked(start: Array) -> Array:
+    """The plan to start from, float32 [H, 2].
+
+    Raises:
+      ValueError: for another shape, or where it is concrete and not finite.
+    """
+    if jnp.ndim(start) != 2 or jnp.shape(start)[1] != environment_lib.ACTION_CHANNELS or not jnp.shape(start)[0]:
+        raise ValueError(f"planner: got a start {list(jnp.shape(start))}, expected [H, 2].")
+    checks.finite("planner", start=start)
+    return jnp.asarray(start, jnp.float32)
+
+
 PLANNERS = {"cem": cem, "mppi": mppi, "gradient": gradient}
 
 
@@ -139,8 +157,8 @@ def imagined_returns(environment: environment_lib.Environment, params: environme
         def one(key, plan):
             _, transitions = environment_lib.play(environment, params, key, state, plan, horizon)
             alive = 1.0 - transitions.terminated.astype(jnp.float32)
-            before = jnp.concatenate([jnp.ones(1), jnp.cumprod(alive)[:-1]])
-            return (discount ** jnp.arange(horizon) * before * transitions.reward).sum()
+            before = jnp.concatenate([jnp.ones(1, jnp.float32), jnp.cumprod(alive)[:-1]])
+            return (discount ** jnp.arange(horizon, dtype=jnp.float32) * before * transitions.reward).sum()
 
         keys = jax.random.split(key, noises)
         return jax.vmap(lambda plan: jax.vmap(one, (0, None))(keys, plan).mean())(plans)
@@ -155,13 +173,14 @@ def shift(plan: Array) -> Array:
 
 def coloured_noise(key: Array, shape: tuple[int, int, int], exponent: float) -> Array:
     """Unit-variance noise [P, H, A] whose power falls with frequency over H as 1 / f**exponent; 0 gives white noise."""
-    white = jax.random.normal(key, shape)
+    white = jax.random.normal(key, shape, jnp.float32)
     if not exponent or shape[1] < 2:
         return white
-    frequencies = jnp.fft.rfftfreq(shape[1])
+    frequencies = jnp.fft.rfftfreq(shape[1]).astype(jnp.float32)
     scale = jnp.maximum(frequencies, frequencies[1]) ** (-exponent / 2)
     coloured = jnp.fft.irfft(jnp.fft.rfft(white, axis=1) * scale[None, :, None], n=shape[1], axis=1)
-    weights = jnp.where((jnp.arange(scale.shape[0]) == 0) | (2 * jnp.arange(scale.shape[0]) == shape[1]), 1.0, 2.0)
+    weights = jnp.where((jnp.arange(scale.shape[0]) == 0) | (2 * jnp.arange(scale.shape[0]) == shape[1]),
+                        jnp.float32(1.0), jnp.float32(2.0))
     return coloured / jnp.sqrt((weights * scale**2).sum() / shape[1])
 
 

@@ -110,12 +110,12 @@ def read_camera(date_folder: pathlib.Path, number: str) -> schema.Camera:
     projection = cameras[f"P_rect_{number}"].reshape(3, 4)
     intrinsics = projection[:, :3]
     width_px, height_px = (round(side) for side in cameras[f"S_rect_{number}"])
-    lidar_to_camera0 = _rigid(lidar["R"].reshape(3, 3), lidar["T"])
-    rectify = _rigid(cameras["R_rect_00"].reshape(3, 3), np.zeros(3))
-    shift = _rigid(np.eye(3), np.linalg.solve(intrinsics, projection[:, 3]))
-    lidar_to_ego = _rigid(np.eye(3), np.array([0.0, 0.0, LIDAR_HEIGHT_M]))
-    camera_to_ego = lidar_to_ego @ np.linalg.inv(shift @ rectify @ lidar_to_camera0)
     try:
+        lidar_to_camera0 = _rigid(lidar["R"].reshape(3, 3), lidar["T"])
+        rectify = _rigid(cameras["R_rect_00"].reshape(3, 3), np.zeros(3))
+        shift = _rigid(np.eye(3), np.linalg.solve(intrinsics, projection[:, 3]))
+        lidar_to_ego = _rigid(np.eye(3), np.array([0.0, 0.0, LIDAR_HEIGHT_M]))
+        camera_to_ego = lidar_to_ego @ np.linalg.inv(shift @ rectify @ lidar_to_camera0)
         return schema.Camera.of(width_px, height_px, intrinsics, camera_to_ego)
     except ValueError as error:
         raise schema.DataError(f"{date_folder}: calib_cam_to_cam.txt and calib_velo_to_cam.txt make no camera: "

@@ -58,7 +58,8 @@ def observe_step(model: WorldModel, variables: Variables, live: LiveState, obser
       LiveState; imagine from its `latent`.
 
     Raises:
-      ValueError: if shapes or dtypes do not fit the model, or an action is out of range.
+      ValueError: if shapes or dtypes do not fit the model, an action is out of range, or a concrete input not finite.
+      TypeError: for forward-mode derivatives through convolutions that have none (ModelConfig.convolution).
     """
     batch_size = live.frame.shape[0]
     action = jnp.asarray(previous_action, jnp.float32)
@@ -69,7 +70,10 @@ def observe_step(model: WorldModel, variables: Variables, live: LiveState, obser
     fields = {name: jnp.asarray(value) if name in UNTIMED_FIELDS else jnp.expand_dims(jnp.asarray(value), 1)
               for name, value in observation.items()}
     batch = Batch(action=jnp.expand_dims(action, 1), is_first=jnp.expand_dims(live.frame == 0, 1), **fields)
-    return _observe_step(model, variables, live, batch.validate(), sampled)
+    checks.observation("observe_step", model, batch.validate())
+    checks.finite("observe_step", state=live.latent)
+    checks.forward_mode("observe_step", model, variables, live.latent, batch)
+    return _observe_step(model, variables, live, batch, sampled)
 
 
 @functools.partial(jax.jit, static_argnames=("model", "sampled"))

@@ -117,9 +117,12 @@ def observe(model: WorldModel, variables: Variables, key: jax.Array, batch: Batc
       sampled: sample the latents; otherwise take their means (the key is then not used).
 
     Raises:
-      ValueError: if the batch or the key does not fit.
+      ValueError: if the batch or the key does not fit, or a concrete input is not finite.
+      TypeError: for forward-mode derivatives through convolutions that have none (ModelConfig.convolution).
     """
     batch.validate()
+    checks.observation("observe", model, batch)
+    checks.forward_mode("observe", model, variables, batch)
     return _observe(model, variables, sample_keys(key, batch.batch_size), batch, sampled)
 
 
@@ -162,6 +165,7 @@ def imagine(model: WorldModel, variables: Variables, key: jax.Array, state: Late
         branches, horizon = checks.actions(actions_or_policy, lead, horizon, branches)
         driver = driver.reshape(count, *driver.shape[len(lead):])
     horizon = checks.counts(horizon, branches)
+    checks.finite("imagine", state=state, temperature=temperature)
     flat = jax.tree.map(lambda leaf: leaf.reshape(count, *leaf.shape[len(lead):]), state)
     dream = _imagine(model, variables, keys, flat, driver, jnp.float32(temperature), horizon, branches, sampled,
                      same_noise)
@@ -170,8 +174,13 @@ def imagine(model: WorldModel, variables: Variables, key: jax.Array, state: Late
 
 def decode(model: WorldModel, variables: Variables, states: LatentState | Dream | jax.Array,
            heads: Sequence[str] | None = None) -> Predictions:
-    """Decodes latent states (or their features) with any leading axes; see WorldModel.decode."""
+    """Decodes latent states (or their features) with any leading axes; see WorldModel.decode.
+
+    Raises:
+      TypeError: for forward-mode derivatives through convolutions that have none (ModelConfig.convolution).
+    """
     features = states if isinstance(states, jax.Array) else states.features
+    checks.forward_mode("decode", model, variables, features)
     return _decode(model, variables, features, None if heads is None else tuple(heads))
 
 
@@ -233,7 +242,7 @@ def _imagine_flat(model, variables, keys_noise, keys_policy, state, driver, *, t
             noise = jnp.zeros_like(state.stochastic)
         else:
             keys = fold(fold(keys_noise, index), 0)
-            noise = temperature * jax.vmap(lambda key: jax.random.normal(key, shape))(keys)
+            noise = temperature * jax.vmap(lambda key: jax.random.normal(key, shape, jnp.float32))(keys)
         state, prior = model.imagine_step(variables, noise, action, state)
         return state, (state, action, prior)
 

@@ -183,6 +183,11 @@ def _per_axis(name: str, value: PerAxis, rank: int, lowest: int) -> tuple[int, .
     return values
 
 
+def reverse_only(implementation: str) -> bool:
+    """Whether convolutions of this implementation have reverse-mode derivatives alone, on this backend."""
+    return implementation != "xla" and _use_cpu_forms(implementation)
+
+
 def _use_cpu_forms(implementation: str) -> bool:
     return implementation == "gemm" or jax.default_backend() == "cpu"
 

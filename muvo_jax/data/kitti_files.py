@@ -143,7 +143,7 @@ def _read_calibration(path: pathlib.Path, sizes: dict[str, int]) -> dict[str, np
             values[key] = np.array([float(word) for word in lines[key].split()])
         except (KeyError, ValueError):
             values[key] = np.zeros(0)
-        if values[key].size != size:
-            raise schema.DataError(f"{path}: expected a line \"{key}:\" with {size} numbers; the file has the keys "
-                                   f"{', '.join(lines) or 'none'}. Unpack the calibration of this date again.")
+        if values[key].size != size or not np.isfinite(values[key]).all():
+            raise schema.DataError(f"{path}: expected a line \"{key}:\" with {size} finite numbers; the file has the "
+                                   f"keys {', '.join(lines) or 'none'}. Unpack the calibration of this date again.")
     return values

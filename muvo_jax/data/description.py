@@ -105,6 +105,6 @@ def check_names(header: dict, path: pathlib.Path, known: Collection[str]) -> Non
     """Raises DataError for a top-level entry that looks like a misspelt one of `known` or of the sections."""
     names = (*known, *_SECTIONS)
     for name in header:
-        near = difflib.get_close_matches(name, names, n=1, cutoff=0.75)
+        near = difflib.get_close_matches(name, names, n=1, cutoff=0.7)
         if name not in names and near:
             raise schema.DataError(f"{path}: {name!r} is unknown. Did you mean {near[0]}?")

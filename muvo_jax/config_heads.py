@@ -3,7 +3,8 @@
 A new head is one row in each of four places, all by the same name, and nothing else:
 
 1. TARGETS below: the Batch fields that its loss reads, each with its shape for one frame. A field that no recording had
-   so far also needs a line in types.Batch, types.BATCH_FIELDS and data/schema.RawFrame, and a reader that fills it.
+   so far also needs a line in types.Batch, types.BATCH_FIELDS, data/schema.RawFrame and the table data/fields.py, which
+   tells the plain format's reader and writer how it is stored.
 2. model/heads.TABLE: its decoder (`_vector` for a number or a few of them).
 3. objectives/terms.TABLE: its loss terms, each with the field of LossConfig that weighs it.
 4. LossConfig below: these weights.

@@ -54,11 +54,14 @@ def frame_chamfer_m(prediction: types.ArrayLike, truth: types.ArrayLike, *, retu
       seed: names this batch; the frame's place is added to it.
 
     Returns:
-      float64 [B, H], NaN where one side of a frame is empty.
+      float64 [B, H], NaN where one side of a frame is empty, or the prediction is not finite.
     """
     prediction, truth = np.asarray(prediction), np.asarray(truth)
     distances = np.empty(prediction.shape[:2])
     for window, step in np.ndindex(distances.shape):
+        if not np.isfinite(prediction[window, step]).all():
+            distances[window, step] = np.nan
+            continue
         clouds = (range_view_points(prediction[window, step], return_threshold_m),
                   range_view_points(truth[window, step]))
         distances[window, step] = chamfer_m(*(keyed_subset(cloud, points, (*seed, window, step, side))

@@ -40,7 +40,7 @@ def splat(points_m: Array, valid: Array, geometry: RangeViewGeometry) -> Array:
     row, column, range_m = _polar(points_m, geometry)
     inside = valid & (row >= 0) & (row < geometry.rows)
     pixel = jnp.where(inside, row * geometry.columns + column, cells)
-    pixel = jax.lax.stop_gradient(pixel + (cells + 1) * jnp.arange(count)[:, None]).reshape(-1)
+    pixel = jax.lax.stop_gradient(pixel + (cells + 1) * jnp.arange(count, dtype=jnp.int32)[:, None]).reshape(-1)
     ranges = jax.lax.stop_gradient(range_m).reshape(-1)
     nearest = jnp.full((count * (cells + 1),), jnp.inf, jnp.float32).at[pixel].min(ranges)
     wins = ranges == nearest[pixel]
@@ -202,7 +202,7 @@ def _hole(like: Array) -> Array:
 
 def _camera_rays(intrinsics: Array, camera_to_ego: Array, rows: int, columns: int) -> Array:
     """Unit vectors [N, H * W, 3] (ego axes) through the pixels' centres."""
-    v_px, u_px = jnp.meshgrid(jnp.arange(rows) + 0.5, jnp.arange(columns) + 0.5, indexing="ij")
+    v_px, u_px = jnp.meshgrid(*(jnp.arange(side, dtype=jnp.float32) + 0.5 for side in (rows, columns)), indexing="ij")
     pixels = jnp.stack([u_px, v_px, jnp.ones_like(u_px)], axis=-1).reshape(-1, 3)
     to_ego = jnp.einsum("nij,njk->nik", camera_to_ego[:, :3, :3], jnp.linalg.inv(intrinsics),
                         precision=jax.lax.Precision.HIGHEST)

@@ -149,10 +149,12 @@ def record_run(directory: pathlib.Path, town: Town, job: TownDrive) -> Iterator[
     for _ in range(WARM_UP_FRAMES):
         state = town.step(state, town.expert(state))
     for frame in range(job.frames):
-        seen = town.render(state)
+        seen = dict(town.render(state))
         action = _chosen(town, state, job.restless)
         x_m, y_m, yaw_rad = state.pose
-        writer.write({**seen, "occupancy": town.occupancy(seen), "frame_id": frame,
+        occupancy = town.occupancy(seen)
+        del seen["range_view"]  # the points say the same
+        writer.write({**seen, "occupancy": occupancy, "frame_id": frame,
                       "timestamp_s": round(frame / town.config.contract.rate_hz, 6), "x_m": x_m, "y_m": y_m,
                       "yaw_rad": yaw_rad, "acceleration": action[0], "steering": action[1],
                       "weather": WEATHER_NAMES[int(state.weather)]})

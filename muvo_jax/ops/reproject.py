@@ -231,7 +231,8 @@ def _hole(like: Array) -> Array:
 
 def _camera_rays(intrinsics: Array, camera_to_ego: Array, rows: int, columns: int) -> Array:
     """Unit vectors [N, H * W, 3] (ego axes) through the pixels' centres."""
-    v_px, u_px = jnp.meshgrid(jnp.arange(rows) + 0.5, jnp.arange(columns) + 0.5, indexing="ij")
+    centres_px = [jnp.arange(side, dtype=jnp.float32) + 0.5 for side in (rows, columns)]
+    v_px, u_px = jnp.meshgrid(*centres_px, indexing="ij")
     pixels = jnp.stack([u_px, v_px, jnp.ones_like(u_px)], axis=-1).reshape(-1, 3)
     to_ego = jnp.einsum("nij,njk->nik", camera_to_ego[:, :3, :3], jnp.linalg.inv(intrinsics),
                         precision=jax.lax.Precision.HIGHEST)

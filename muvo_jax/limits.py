@@ -91,15 +91,16 @@ def check(instance: Any) -> None:
     Raises:
       RangeError: naming class, field, value and range.
     """
-    for name, limits, whole in of(type(instance)):
+    cls: Any = type(instance)
+    for name, limits, whole in of(cls):
         value = getattr(instance, name)
         for number in _numbers(value):
             if isinstance(number, bool) or not isinstance(number, numbers.Real) or (
                     whole and not isinstance(number, numbers.Integral)):
                 kind = "whole numbers" if whole else "numbers"
-                raise RangeError(type(instance).__name__, name, f"is {value!r}; expected {kind}.")
+                raise RangeError(cls.__name__, name, f"is {value!r}; expected {kind}.")
             if not limits.holds(float(number)):
-                raise RangeError(type(instance).__name__, name, f"is {value!r}; it must be {limits}.")
+                raise RangeError(cls.__name__, name, f"is {value!r}; it must be {limits}.")
 
 
 def _numbers(value: Any) -> typing.Iterator[Any]:

@@ -106,12 +106,11 @@ class PlainRecording:
         if contract is None:
             raise schema.DataError(f"{toml_path}: section [action] is missing; it says what actions mean.")
         section = lambda name, needed: description.section(header, name, toml_path, required=needed)
-        voxels = None
-        if {"occupancy", "occupancy_moving_mask", "birds_eye_classes"} & modalities:  # [voxels] alone says what to make
-            voxels = section("voxels", True)
+        has_axis = lambda axis: any(axis in fields.FIELDS[name].shape for name in modalities)
+        voxels = section("voxels", True) if has_axis("X") else None  # [voxels] alone says what to make
         self.description = schema.RecordingDescription(
             name=str(description.field(header, "name", str, toml_path)), kind="plain", rate_hz=rate_hz,
-            camera=section("camera", bool({"image", "image_moving_mask"} & modalities)),
+            camera=section("camera", has_axis("H")),
             lidar=section("lidar", "points_m" in modalities),
             voxels=voxels, contract=contract, splits=splits,
             modalities=modalities | (set(_OF_IMAGE) if "image" in modalities else set()),
@@ -176,12 +175,12 @@ class PlainRecording:
             values = files.read_image(path, _MODES[name])
             values = decode_depth(values) if name == "depth_m" else values
         camera, grid = described.camera, described.voxels
-        sizes: dict[str | int, int | None] = {"N": None}
+        sizes: dict[str, int | None] = {"N": None}
         if camera is not None:
             sizes |= {"H": camera.height_px, "W": camera.width_px}
         if grid is not None:
             sizes |= dict(zip("XYZ", grid.shape, strict=True))
-        values = fields.conform(name, values, str(path), tuple(sizes.get(size, size) if isinstance(size, str) else size
+        values = fields.conform(name, values, str(path), tuple(sizes[size] if isinstance(size, str) else size
                                                                for size in field.shape))
         if name in ("image_classes", "point_classes"):
             fields.check_classes(name, values, self._class_names, str(path))

@@ -104,7 +104,8 @@ def choose_window(recording: schema.Recording, config: config_lib.Config, option
     if split not in description.splits:
         raise ValueError(f"--split: {description.name!r} has no split {split!r}; it has "
                          f"{', '.join(description.splits)}.")
-    sequences = [sequence for sequence in recording.sequences if sequence.split == split]
+    needs = prepare_lib.needed(config, description.modalities)
+    sequences = [sequence for sequence in recording.sequences if sequence.split == split and sequence.has(needs)]
     named = [sequence for sequence in sequences if options.sequence in (None, sequence.name)]
     if not named:
         known = ", ".join(sorted({sequence.name for sequence in sequences})[:12])

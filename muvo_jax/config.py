@@ -361,6 +361,11 @@ class Config:
         needed = self.model.first_guess == "last_seen" or self.model.action_path == "recurrence"
         known = needed and self.contract.kinematics == "bicycle"
         wanted = Kinematics(self.contract, self.data.stride) if known else None
+        if self.model.first_guess == "last_seen" and wanted is None and "ego_motion" not in self.model.heads:
+            raise ValueError(f"model.first_guess=last_seen moves what was seen as the car moves, but "
+                             f"contract.kinematics is {self.contract.kinematics!r} and the model has the heads "
+                             f"{', '.join(self.model.heads)}. Add the head ego_motion (--with-heads=ego_motion) or "
+                             f"choose model.first_guess=training_mean.")
         if self.model.kinematics != wanted:  # one truth: contract and stride
             object.__setattr__(self, "model", dataclasses.replace(self.model, kinematics=wanted))
 

@@ -7,19 +7,22 @@ import pathlib
 import sys
 from typing import Annotated
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 import tyro
 
-from muvo_jax import command_line, evaluate, types
-from muvo_jax import config as config_lib
-from muvo_jax.data import pipeline, schema, windows
-from muvo_jax.data import prepare as prepare_lib
-from muvo_jax.metrics import protocol, warp
-from muvo_jax.model import rollout, world_model
-from muvo_jax.training import screen
-from muvo_jax.viz import sheets
+from muvo_jax import command_line, late
+
+with late.imports():
+    import jax
+
+    from muvo_jax import config as config_lib
+    from muvo_jax import evaluate, types
+    from muvo_jax.data import pipeline, schema, windows
+    from muvo_jax.data import prepare as prepare_lib
+    from muvo_jax.metrics import protocol, warp
+    from muvo_jax.model import rollout, world_model
+    from muvo_jax.training import screen
+    from muvo_jax.viz import sheets
 
 MOST_COLUMNS = 3  # predictions beside the truth in one animation
 
@@ -134,12 +137,12 @@ def dream_window(model: world_model.WorldModel, variables: types.Variables, key:
     sampled = branches > 1
     heads = protocol.shown_heads(model.config)
     observed = rollout.observe(model, variables, key, batch.time_slice(0, context), sampled=False)
-    actions = jnp.asarray(batch.action)[:, context - 1 : context + horizon - 1]
+    actions = jax.numpy.asarray(batch.action)[:, context - 1 : context + horizon - 1]
     imagined = rollout.imagine(model, variables, key, observed.last, actions, branches=branches, sampled=sampled)
     futures = []
     for branch in range(branches):
-        states = jax.tree.map(lambda seen, dreamt, branch=branch: jnp.concatenate([seen, dreamt[:, branch]], axis=1),
-                              observed.states, imagined.states)
+        join = lambda seen, dreamt, branch=branch: jax.numpy.concatenate([seen, dreamt[:, branch]], axis=1)
+        states = jax.tree.map(join, observed.states, imagined.states)
         decoded = rollout.decode(model, variables, states, heads, memory=observed.memory)
         futures.append(jax.device_get(protocol.finish(decoded)))
     return futures

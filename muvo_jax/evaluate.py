@@ -7,14 +7,18 @@ import pathlib
 import sys
 from typing import Annotated, Any
 
-import jax
 import tyro
 
-from muvo_jax import command_line, evaluation_report
-from muvo_jax import config as config_lib
-from muvo_jax.data import pipeline, prepare
-from muvo_jax.metrics import protocol
-from muvo_jax.training import checkpoint_meta, screen, validation
+from muvo_jax import command_line, late
+
+with late.imports():
+    import jax
+
+    from muvo_jax import config as config_lib
+    from muvo_jax import evaluation_report
+    from muvo_jax.data import pipeline, prepare
+    from muvo_jax.metrics import protocol
+    from muvo_jax.training import checkpoint_meta, screen, validation
 
 
 @dataclasses.dataclass(frozen=True)

@@ -10,6 +10,7 @@ from typing import Any
 
 import rich.table
 
+from muvo_jax.data import words
 from muvo_jax.metrics import occupancy, protocol
 
 # metric -> (label, decimals, whether higher is better)
@@ -36,7 +37,7 @@ STEP_METRICS = ("psnr_db", "chamfer_m", "iou_occ_above_observed", "iou_occ_obser
 def screen_table(split: str, phase: str, scores: Mapping[str, Any]) -> rich.table.Table:
     """One split and phase: a row for each metric, the best source bold."""
     phase_scores = scores[phase]
-    title = f"{split}: {phase} frames, {scores['windows']} windows of {scores['drives']} drives"
+    title = f"{split}: {phase} frames, {counts_text(scores)}"
     table = rich.table.Table(title=title, title_justify="left")
     table.add_column("metric")
     for source in phase_scores:
@@ -60,6 +61,11 @@ def screen_table(split: str, phase: str, scores: Mapping[str, Any]) -> rich.tabl
         undefined = [str(metrics[name].get("undefined", "")) for metrics in phase_scores.values() if name in metrics]
         table.add_row(label, *cells, " / ".join(part for part in undefined if part))
     return table
+
+
+def counts_text(scores: Mapping[str, Any]) -> str:
+    """Such as "16 windows of 4 drives"."""
+    return f"{words.counted(scores['windows'], 'window')} of {words.counted(scores['drives'], 'drive')}"
 
 
 def marked(values: Mapping[str, float], sources: Mapping[str, Any], decimals: int, higher: bool,
@@ -116,7 +122,7 @@ def markdown(report: Mapping[str, Any]) -> str:
              f"scores and movers' PSNR come from sums over the whole split. In brackets 95 % intervals by bootstrap "
              f"over drives. Above the road: {occupancy.ABOVE_ROAD_M:g} m and more over the ground under the ego.", ""]
     for split, scores in report["splits"].items():
-        lines += [f"## {split} ({scores['windows']} windows of {scores['drives']} drives)", ""]
+        lines += [f"## {split} ({counts_text(scores)})", ""]
         for phase in protocol.PHASES:
             lines += [f"### {phase} frames", "", *_average_table(scores[phase]), ""]
         lines += ["### imagined frames, step by step", "", *_step_table(scores["imagined"]), "",

@@ -202,6 +202,7 @@ class Memory(_Indexable):
       range_view: float32 [B, F, Hr, Wr, 4], as Batch.range_view; None for a model without lidar.
       image: uint8 [B, F, H, W, 3], as Batch.image; None for a model without camera.
       intrinsics, camera_to_ego: float32 [B, 3, 3] and [B, 4, 4]; None without image.
+      evidence: float32 [B, X', Y', 2 Z] for voxels, worked out once for many states (memory.with_evidence); or None.
     """
 
     pose: Array
@@ -209,6 +210,7 @@ class Memory(_Indexable):
     image: Array | None = None
     intrinsics: Array | None = None
     camera_to_ego: Array | None = None
+    evidence: Array | None = None
 
 
 @flax.struct.dataclass

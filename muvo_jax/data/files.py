@@ -14,9 +14,10 @@ from collections.abc import Iterable
 import numpy as np
 from PIL import Image
 
-from muvo_jax.data import schema
+from muvo_jax.data import schema, words
 
 BAD_POINT_SHARE = 0.01  # more non-finite points than this are a broken file, not noise
+FEW_SHARE = 0.05  # gaps at no more frames than these (or at one) are what recordings have; more are a fault
 GAP_PERIODS = 1.5  # a time step longer than this many periods is a gap
 # Pillow raises any of these for broken chunks and for sizes that would fill the memory.
 _IMAGE_ERRORS = (OSError, SyntaxError, ValueError, TypeError, IndexError, OverflowError, MemoryError, zlib.error,
@@ -162,6 +163,10 @@ def gap_free(present: np.ndarray, breaks: np.ndarray) -> list[tuple[int, int]]:
     return pieces
 
 
+class GapWarning(schema.DataWarning):
+    """A few frames that a sensor lacks, or jumps in time: sequences are cut there, and the rest is whole."""
+
+
 def warn_of_gaps(where: str, present: np.ndarray, absent: dict[str, int], late: np.ndarray, pieces: int) -> None:
     """Warns, with counts, of frames that a sensor lacks and of gaps in time; says nothing where there are none.
 
@@ -180,5 +185,7 @@ def warn_of_gaps(where: str, present: np.ndarray, absent: dict[str, int], late: 
     if late.any():
         found.append(f"time jumps by more than {GAP_PERIODS} periods at {int(late.sum())} of {len(present)} frames")
     if found:
-        warnings.warn(f"{where}: {' and '.join(found)}; what is left makes {pieces} gap-free sequences.",
-                      schema.DataWarning, stacklevel=4)
+        few = max(int((~present).sum()), int(late.sum())) <= max(1, FEW_SHARE * len(present))
+        left = words.counted(pieces, "gap-free sequence")
+        warnings.warn(f"{where}: {' and '.join(found)}; what is left makes {left}.",
+                      GapWarning if few else schema.DataWarning, stacklevel=4)

@@ -64,10 +64,13 @@ def adapt(config: config_lib.Config, recording: schema.Recording, *, keep: Colle
     """
     description = recording.description
     notes: list[str] = []
-    model = _fit_model(config.model, description, notes)
+    model = _fit_first_guess(_fit_model(config.model, description, notes), description, keep, notes)
     data = _fit_windows(config.data, recording, keep, notes)
     contract = dataclasses.replace(description.contract, step_action=config.contract.step_action)
-    return Adapted(dataclasses.replace(config, model=model, data=data, contract=contract), tuple(notes))
+    train = config.train
+    if train.observe_frames > data.context and "train.observe_frames" not in keep:  # as many as evaluation observes
+        train = dataclasses.replace(train, observe_frames=data.context)
+    return Adapted(dataclasses.replace(config, model=model, data=data, train=train, contract=contract), tuple(notes))
 
 
 def prepare_frame(raw: schema.RawFrame, config: config_lib.Config) -> PreparedFrame:
@@ -223,6 +226,33 @@ def _fit_model(model: config_lib.ModelConfig, description: schema.RecordingDescr
         changes["navigation"] = False
         notes.append("no navigation commands are recorded: the model has no such input.")
     return dataclasses.replace(model, **changes)
+
+
+def _fit_first_guess(model: config_lib.ModelConfig, description: schema.RecordingDescription, keep: Collection[str],
+                     notes: list[str]) -> config_lib.ModelConfig:
+    """The model without a memory where the recording does not say how the car moves, or nothing has ranges.
+
+    Raises:
+      DataError: where the user asked for the memory.
+    """
+    if model.first_guess != "last_seen":
+        return model
+    reason = ""
+    if model.lidar == config_lib.NO_SENSOR:
+        reason = "there are no lidar scans, and nothing moves without ranges"
+    elif description.contract.kinematics == "bicycle":
+        if "speed_mps" not in description.modalities:
+            reason = "no speed is recorded, from which actions would move the car"
+    elif "ego_motion" not in model.heads:
+        reason = ("its actions do not say how the car moves (kinematics \"none\"); add --with-heads=ego_motion, which "
+                  "learns it from recorded poses")
+    if not reason:
+        return model
+    if "model.first_guess" in keep:
+        raise schema.DataError(f"model.first_guess=last_seen with recording {description.name!r}: {reason}. Choose "
+                               f"model.first_guess=training_mean otherwise.")
+    notes.append(f"what was last seen is not moved, because {reason}: decoders start from the training mean.")
+    return dataclasses.replace(model, first_guess="training_mean")
 
 
 def _without_what_lacks(model: config_lib.ModelConfig, description: schema.RecordingDescription,

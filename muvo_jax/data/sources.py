@@ -7,7 +7,7 @@ from collections.abc import Callable, Collection
 from typing import Any, NamedTuple
 
 from muvo_jax import config as config_lib
-from muvo_jax.data import carla, carla_runs, files, kitti, plain, prepare, records, schema
+from muvo_jax.data import carla, carla_runs, files, kitti, manifest, plain, prepare, records, schema
 from muvo_jax.data.town import record
 
 
@@ -30,8 +30,8 @@ class Kind(NamedTuple):
 
 
 KINDS = (
-    Kind("packed", f"a folder of shards with {records.MANIFEST_FILE}",
-         lambda path: (path / records.MANIFEST_FILE).is_file(), records.PackedRecording),
+    Kind("packed", f"a folder of shards with {manifest.MANIFEST_FILE}",
+         lambda path: (path / manifest.MANIFEST_FILE).is_file(), records.PackedRecording),
     Kind("plain", f"a folder with {plain.DESCRIPTION_FILE}",
          lambda path: (path / plain.DESCRIPTION_FILE).is_file(), plain.PlainRecording),
     Kind("KITTI raw", "<date>/<date>_drive_NNNN_sync folders, or one of them",
@@ -39,6 +39,9 @@ KINDS = (
     Kind("MUVO CARLA", f"trainval/<mode>/<Town>/<run> folders with {carla_runs.FRAME_FILE}, or one of them",
          lambda path: bool(carla_runs.folders(path)), carla.CarlaRecording),
 )
+
+
+_ARCHIVES = (".zip", ".tar", ".tgz", ".gz", ".xz", ".bz2", ".zst", ".7z", ".rar")
 
 
 def recognise(path: pathlib.Path | str, *, camera: str = "") -> Kind:
@@ -50,9 +53,15 @@ def recognise(path: pathlib.Path | str, *, camera: str = "") -> Kind:
     """
     path = pathlib.Path(path).expanduser()
     known = "; ".join(f"{kind.name} ({kind.layout})" for kind in KINDS)
+    if str(path) == "town" and not path.exists():
+        raise schema.DataError("\"town\" names the built-in world, which python -m muvo_jax.train --data=town records "
+                               "first; here give the folder of a recording, such as that in ~/.cache/muvo_jax.")
     if not path.exists():
         raise schema.DataError(f"data folder {path} does not exist. Expected a recording: {known}; or \"town\", the "
                                f"built-in world.")
+    if path.is_file() and path.name.lower().endswith(_ARCHIVES):
+        raise schema.DataError(f"{path} is an archive: unpack it and give the folder that comes out. Expected a "
+                               f"recording: {known}.")
     if not path.is_dir():
         raise schema.DataError(f"{path} is a file; expected the folder of a recording: {known}.")
     if not any(path.iterdir()):
@@ -83,9 +92,9 @@ def open_recording(path: pathlib.Path | str, *, camera: str = "", skip_corrupt_s
     path = pathlib.Path(path).expanduser()
     kind = recognise(path, camera=camera)
     if kind.open is records.PackedRecording and skip_corrupt_shards:
-        return records.PackedRecording(path, corrupt="skip")
+        return records.PackedRecording(path, corrupt="skip", labels=labels)
     options: dict[str, Any] = {"camera": camera} if camera else {}
-    if kind.open in (plain.PlainRecording, carla.CarlaRecording):
+    if kind.open in (plain.PlainRecording, carla.CarlaRecording, records.PackedRecording):
         options["labels"] = frozenset(labels)
     return kind.open(path, **options)
 

@@ -1,7 +1,7 @@
 """Reads and writes safetensors files: 8 bytes for the length of a header, the header in JSON, then little-endian data.
 
-Written here rather than taken from the safetensors package: the format is these forty lines, the package would be one
-more dependency, and its NumPy interface copies each tensor where a memory map is enough.
+Written here rather than taken from the safetensors package: its NumPy interface knows no bfloat16 (0.8.0 raises
+KeyError: 'BF16'), which checkpoints are stored in, and copies each tensor where a memory map is enough.
 """
 
 from __future__ import annotations

@@ -14,6 +14,7 @@ import jax
 import jax.numpy as jnp
 
 from muvo_jax.config import NO_SENSOR, ModelConfig
+from muvo_jax.geometry import VoxelGrid
 from muvo_jax.ops import motion as motion_ops
 from muvo_jax.ops import reproject
 from muvo_jax.types import RANGE_NO_RETURN_M, Array, Batch, LatentState, Memory, Motion, Vantage
@@ -246,20 +247,61 @@ def _ranges(config: ModelConfig, memory: Memory, rows: Array, index: Array, know
 
 def _image(config: ModelConfig, memory: Memory, rows: Array, index: Array, known: Array, pose: Array,
            view: Glimpse) -> Glimpse:
-    image = memory.image[rows, index].astype(jnp.float32) / 255.0
-    moved, inside = reproject.move_image(image, view.filled_m, pose, memory.intrinsics[rows],
-                                         memory.camera_to_ego[rows], config.range_view)
+    images = memory.image.reshape(-1, *memory.image.shape[2:])
+    moved, inside = reproject.move_image(images, view.filled_m, pose, memory.intrinsics[rows],
+                                         memory.camera_to_ego[rows], config.range_view,
+                                         rows * memory.image.shape[1] + index)
     covered = jnp.expand_dims((inside & known.reshape(-1, 1, 1)).astype(jnp.float32), -1)
-    return Glimpse(image=moved * covered, covered=covered)
+    return Glimpse(image=moved / 255.0 * covered, covered=covered)
 
 
 def _evidence(config: ModelConfig, memory: Memory, rows: Array, index: Array, known: Array, pose: Array) -> Glimpse:
-    frames, places = memory.pose.shape[1], index.shape[1]
-    which = (rows[:, None] * frames + index).reshape(-1)
-    scans_m = memory.range_view[..., 3].reshape(-1, config.range_view.rows, config.range_view.columns)
-    evidence = reproject.scan_evidence(scans_m, which, pose.reshape(-1, 3), config.voxels, config.range_view)
-    evidence = evidence.reshape(len(rows), places, *config.voxels.shape)
+    if memory.evidence is not None:
+        both = reproject.move_voxels(memory.evidence, pose[:, -1], config.voxels, _wide(config.voxels), rows)
+        newest, older = jnp.split(both, 2, axis=-1)
+        return Glimpse(newest=newest, older=older)
+    newest, older = _scans_evidence(config, memory, rows, index, known, pose, config.voxels)
+    return Glimpse(newest=newest, older=older)
+
+
+def _scans_evidence(config: ModelConfig, memory: Memory, rows: Array, index: Array, known: Array, pose: Array,
+                    grid: VoxelGrid) -> tuple[Array, Array]:
+    """Evidence of the newest scan and of all before it, [n, X, Y, Z] each in [-1, 1].
+
+    A voxel that holds a return is occupied, as in the labels; the beam through its centre says the rest.
+    """
+    frames, places, view = memory.pose.shape[1], index.shape[1], config.range_view
+    flat_pose = pose.reshape(-1, 3)
+    scans_m = memory.range_view[..., 3].reshape(-1, view.rows, view.columns)
+    evidence = reproject.scan_evidence(scans_m, (rows[:, None] * frames + index).reshape(-1), flat_pose, grid, view)
+    scans = memory.range_view[rows[:, None], index].reshape(len(flat_pose), -1, 4)
+    hits = reproject.hit_voxels(motion_ops.into_frame(scans[..., :3], flat_pose), scans[..., 3] > 0.0, grid)
+    evidence = jnp.where(hits > 0.0, 1.0, evidence).reshape(len(rows), places, *grid.shape)
     evidence = jnp.where(known.reshape(*known.shape, 1, 1, 1), evidence, 0.0)
     weights = FADE ** jnp.arange(places - 2, -1, -1, dtype=jnp.float32).reshape(1, -1, 1, 1, 1)
-    older = (evidence[:, :-1] * weights).sum(axis=1)
-    return Glimpse(newest=evidence[:, -1], older=jnp.clip(older, -1.0, 1.0))
+    return evidence[:, -1], jnp.clip((evidence[:, :-1] * weights).sum(axis=1), -1.0, 1.0)
+
+
+def with_evidence(config: ModelConfig, memory: Memory | None, vantage: Vantage) -> Memory | None:
+    """The memory with the evidence for voxels worked out once, for many states that are imagined from its newest
+    observation: a planner's. Resampled from there it is a little blurred, and ends half a grid beyond the grid.
+
+    vantage: [B], of the states from which imagination starts.
+    """
+    if memory is None or "occupancy" not in config.heads:
+        return memory
+    places, rows = config.memory_frames, jnp.arange(memory.pose.shape[0])
+    index = jnp.broadcast_to(memory.pose.shape[1] + jnp.arange(-places, 0, dtype=jnp.int32)[None], (len(rows), places))
+    known = (index >= vantage.first[:, None]) & (index >= 0)
+    index = jnp.maximum(index, 0)
+    pose = motion_ops.relative(jnp.zeros((*index.shape, 3)), memory.pose[rows[:, None], index])
+    evidence = _scans_evidence(config, memory, rows, index, known, pose, _wide(config.voxels))
+    return memory.replace(evidence=jnp.concatenate(evidence, axis=-1))
+
+
+def _wide(grid: VoxelGrid) -> VoxelGrid:
+    """The grid with half its length more on each side."""
+    x, y, z = grid.shape
+    low_x, low_y, low_z = grid.origin_m
+    return VoxelGrid((2 * x, 2 * y, z), grid.voxel_size_m,
+                     (low_x - 0.5 * x * grid.voxel_size_m, low_y - 0.5 * y * grid.voxel_size_m, low_z))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 from collections.abc import Mapping
 
@@ -96,9 +97,10 @@ def _observe_step(model, variables, live, batch, sampled):
     before = live.latent.vantage
     step, speed_mps = _measured(model, variables, batch, before, latent)
     still = Motion(jnp.zeros_like(before.motion.pose), speed_mps)
-    vantage = before.replace(motion=still, first=jnp.maximum(before.first - 1, 0), steps=jnp.zeros_like(before.steps))
+    vantage = dataclasses.replace(before, motion=still, first=jnp.maximum(before.first - 1, 0),
+                                  steps=jnp.zeros_like(before.steps))
     remembered = None if live.memory is None else memory_lib.remember(live.memory, batch, step)
-    return LiveState(latent.replace(vantage=vantage), live.keys, live.frame + 1, remembered)
+    return LiveState(dataclasses.replace(latent, vantage=vantage), live.keys, live.frame + 1, remembered)
 
 
 def _measured(model, variables, batch, before, latent):

@@ -63,8 +63,8 @@ def town() -> config_lib.Config:
         augmentation=config_lib.AugmentationConfig(mirror=True, light=True),
         optimizer=config_lib.OptimizerConfig(learning_rate=3e-3, warmup_fraction=0.1, clip_norm=10.0),
         data=config_lib.DataConfig(frames=12),
-        train=config_lib.TrainConfig(steps=220, batch=8, decode_frames=2, observe_frames=6, restart=True,
-                                     validate_every=110, checkpoint_every=110, preview_every=220, validation_windows=8),
+        train=config_lib.TrainConfig(steps=200, batch=8, decode_frames=2, observe_frames=6, restart=True,
+                                     validate_every=100, checkpoint_every=100, preview_every=200, validation_windows=8),
         evaluation=config_lib.EvaluationConfig(windows=32),
     )
 

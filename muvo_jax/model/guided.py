@@ -69,9 +69,11 @@ class GuidedDecoder(linen.Module):
             x = conv(f"draw_{scale}", jnp.concatenate([x, down[scale]], axis=-1), width // _WIDTHS[scale])
             out[scale] = dense(f"head_{scale}", x, channels[scale]).astype(jnp.float32)
         # Full size is drawn in blocks of 2x2 pixels: a quarter of the places, with channels enough for a fast product.
-        x = conv("draw_1", jnp.concatenate([x, conv_cpu.space_to_depth(down[1], (2, 2))], axis=-1), width // _WIDTHS[2])
-        blocks = dense("head_1", x, 4 * channels[1]).astype(jnp.float32)
-        return {1: conv_cpu.depth_to_space(blocks, (2, 2)), **out}
+        seen = conv_cpu.space_to_depth(down[1], (2, 2))
+        x = conv("draw_1", jnp.concatenate([x, seen], axis=-1), width // _WIDTHS[2])
+        # What is uncertain is best blurred, a linear function of what is seen, and learned soonest as one.
+        blocks = dense("head_1", x, 4 * channels[1]) + layers.Conv(4 * channels[1], (3, 3), compute, name="blur")(seen)
+        return {1: conv_cpu.depth_to_space(blocks.astype(jnp.float32), (2, 2)), **out}
 
     def _latent(self, features: jax.Array, width: int) -> jax.Array:
         """The latent as a map of the plane: the head's tokens, or a vector unfolded."""

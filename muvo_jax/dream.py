@@ -77,7 +77,7 @@ def dream(options: Options, show: screen.Screen) -> list[pathlib.Path]:
     config = evaluate.fit(config, recording, tuple(chosen))
     window = choose_window(recording, config, options)
     batch = pipeline.Frames(recording, config).batch([window], judged=True)
-    futures = dream_window(loaded.model, loaded.variables, jax.random.key(options.seed), batch,
+    futures = dream_window(world_model.WorldModel(config.model), loaded.variables, jax.random.key(options.seed), batch,
                            context=config.data.context, horizon=config.data.horizon, branches=options.branches)
     labels = ["world model"] if options.branches == 1 else [f"future {index + 1}" for index in range(len(futures))]
     views = {label: sheets.views_of_frames(frames, 0)
@@ -104,7 +104,8 @@ def choose_window(recording: schema.Recording, config: config_lib.Config, option
     if split not in description.splits:
         raise ValueError(f"--split: {description.name!r} has no split {split!r}; it has "
                          f"{', '.join(description.splits)}.")
-    sequences = [sequence for sequence in recording.sequences if sequence.split == split]
+    needs = prepare_lib.needed(config, description.modalities)
+    sequences = [sequence for sequence in recording.sequences if sequence.split == split and sequence.has(needs)]
     named = [sequence for sequence in sequences if options.sequence in (None, sequence.name)]
     if not named:
         known = ", ".join(sorted({sequence.name for sequence in sequences})[:12])

@@ -228,7 +228,7 @@ def frozen_encoder(config: config_lib.Config) -> perceptual.FrozenEncoder | None
     if not config.train.perceptual_from:
         raise ValueError("loss.image_perceptual is on, but train.perceptual_from names no network. Give --perceptual "
                          "with --backbone-weights=PATH or --perceptual-from=RUN.")
-    path = pathlib.Path(config.train.perceptual_from)
+    path = pathlib.Path(config.train.perceptual_from).expanduser()
     if not path.is_dir():
         return backbones.frozen_encoder(backbones.read(path))
     loaded = checkpoint.load_run(path)

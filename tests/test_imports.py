@@ -10,15 +10,17 @@ import pytest
 import muvo_jax
 
 PACKAGE = pathlib.Path(muvo_jax.__file__).parent
-BASE = {"types", "config", "config_augmentation", "config_heads", "config_json", "geometry", "ops"}
+BASE = {"types", "config", "config_augmentation", "config_heads", "config_json", "geometry", "limits",
+        "ops"}
 ALLOWED = {
     "types": set(),
-    "config_augmentation": set(),
-    "config_heads": set(),
-    "config_json": set(),
-    "geometry": set(),
+    "limits": set(),
+    "config_augmentation": {"limits"},
+    "config_heads": {"limits"},
+    "config_json": {"limits"},
+    "geometry": {"limits"},
     "late": set(),
-    "config": {"config_augmentation", "config_heads", "config_json", "geometry"},
+    "config": {"config_augmentation", "config_heads", "config_json", "geometry", "limits"},
     "presets": {"config"},
     "ops": {"types", "config", "geometry"},
     "nn": BASE,

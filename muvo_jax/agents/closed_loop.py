@@ -177,7 +177,7 @@ def planning_driver(simulator: Simulator, environment: environment_lib.Environme
     def driver(key, memory, state, previous):
         key_filter, key_plan = jax.random.split(key)
         if memory is None:
-            memory = PlanMemory(live.start_live(environment.model, key_filter), jnp.zeros((horizon, 2)),
+            memory = PlanMemory(live.start_live(environment.model, key_filter), jnp.zeros((horizon, 2), jnp.float32),
                                 jnp.float32(0))
         observation = {name: np.asarray(value)[None] for name, value in simulator.observe(state).items()}
         memory = plan_step(environment, planner, config, variables, key_plan, memory, observation, previous[None],
@@ -229,7 +229,8 @@ def constant_driver(action: Sequence[float]) -> Driver:
 
 def random_driver() -> Driver:
     """A uniform action in [-1, 1] at every step."""
-    return lambda key, memory, state, previous: (memory, np.asarray(jax.random.uniform(key, (2,), minval=-1.0)))
+    draw = lambda key: np.asarray(jax.random.uniform(key, (2,), jnp.float32, minval=-1.0))
+    return lambda key, memory, state, previous: (memory, draw(key))
 
 
 def summarise(drives: Mapping[str, Sequence[Drive]], expert: str, route_m: float) -> dict[str, dict[str, float]]:

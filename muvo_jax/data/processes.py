@@ -69,14 +69,17 @@ def _run(work: Callable[..., _Result], task: Any) -> _Result:
 
 
 @contextlib.contextmanager
-def locked(path: pathlib.Path, doing: str) -> Iterator[None]:
+def locked(path: pathlib.Path, doing: str, *, wait: bool = False) -> Iterator[None]:
     """Keeps a second process out that locks the same file; the lock falls with the process, however it ends.
+
+    Args:
+      wait: for the other process, instead of an error.
 
     Raises:
       BlockingIOError: where another process holds the lock now.
     """
     try:
-        with filelock.FileLock(path, blocking=False):
+        with filelock.FileLock(path, blocking=wait):
             yield
     except filelock.Timeout as error:
         raise BlockingIOError(f"{path.parent}: another process is {doing} here now; wait for it, or choose another "

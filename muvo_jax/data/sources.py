@@ -20,6 +20,7 @@ class Kind(NamedTuple):
       matches: whether a folder is one.
       open: its reader.
       cameras: names that `open` takes as its `camera`; empty where a recording has one only.
+      options: of "camera", "labels" and "corrupt" those that `open` takes.
     """
 
     name: str
@@ -27,15 +28,17 @@ class Kind(NamedTuple):
     matches: Callable[[pathlib.Path], bool]
     open: Callable[..., schema.Recording]
     cameras: tuple[str, ...] = ()
+    options: tuple[str, ...] = ("labels",)
 
 
 KINDS = (
     Kind("packed", f"a folder of shards with {manifest.MANIFEST_FILE}",
-         lambda path: (path / manifest.MANIFEST_FILE).is_file(), records.PackedRecording),
+         lambda path: (path / manifest.MANIFEST_FILE).is_file(), records.PackedRecording,
+         options=("labels", "corrupt")),
     Kind("plain", f"a folder with {plain.DESCRIPTION_FILE}",
          lambda path: (path / plain.DESCRIPTION_FILE).is_file(), plain.PlainRecording),
     Kind("KITTI raw", "<date>/<date>_drive_NNNN_sync folders, or one of them",
-         lambda path: bool(kitti.find_drives(path)), kitti.KittiRecording, kitti.CAMERAS),
+         lambda path: bool(kitti.find_drives(path)), kitti.KittiRecording, kitti.CAMERAS, options=("camera",)),
     Kind("MUVO CARLA", f"trainval/<mode>/<Town>/<run> folders with {carla_runs.FRAME_FILE}, or one of them",
          lambda path: bool(carla_runs.folders(path)), carla.CarlaRecording),
 )
@@ -91,12 +94,9 @@ def open_recording(path: pathlib.Path | str, *, camera: str = "", skip_corrupt_s
     """
     path = pathlib.Path(path).expanduser()
     kind = recognise(path, camera=camera)
-    if kind.open is records.PackedRecording and skip_corrupt_shards:
-        return records.PackedRecording(path, corrupt="skip", labels=labels)
-    options: dict[str, Any] = {"camera": camera} if camera else {}
-    if kind.open in (plain.PlainRecording, carla.CarlaRecording, records.PackedRecording):
-        options["labels"] = frozenset(labels)
-    return kind.open(path, **options)
+    given: dict[str, Any] = {"labels": frozenset(labels), "corrupt": "skip" if skip_corrupt_shards else "raise"}
+    given |= {"camera": camera} if camera else {}
+    return kind.open(path, **{name: value for name, value in given.items() if name in kind.options})
 
 
 def open_configured(config: config_lib.Config, progress: record.Progress | None = None) -> schema.Recording:

@@ -170,7 +170,7 @@ def _see_voxels(glimpse: memory.VoxelGlimpse, config: ModelConfig) -> jax.Array:
 
 def _compose_voxels(raw, glimpse: memory.VoxelGlimpse, mean, config: ModelConfig) -> dict[int, jax.Array]:
     grid = config.voxels
-    heights = grid.origin_m[2] + grid.voxel_size_m * jnp.arange(grid.shape[2])
+    heights = grid.origin_m[2] + grid.voxel_size_m * jnp.arange(grid.shape[2], dtype=jnp.float32)
     trust = jnp.where(heights >= _OVER_ROAD_M - 1e-3, _TRUST, 0.0).reshape(1, 1, 1, -1)
     # The newest scan has the say; the older ones where it has none. (Added up, what moves is cancelled out.)
     believed = trust * (glimpse.newest + (1.0 - jnp.abs(glimpse.newest)) * glimpse.older)

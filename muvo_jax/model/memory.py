@@ -93,8 +93,8 @@ def inputs(config: ModelConfig) -> dict[str, tuple[int, ...]]:
 def initial_vantage(config: ModelConfig, batch_size: int) -> Vantage:
     """Before anything was seen: no observation is remembered."""
     zeros = jnp.zeros((batch_size,), jnp.int32)
-    return Vantage(Motion(jnp.zeros((batch_size, 3)), jnp.zeros((batch_size,))), zeros + config.memory_frames,
-                   zeros + config.memory_frames - 1, zeros)
+    standing = Motion(jnp.zeros((batch_size, 3), jnp.float32), jnp.zeros((batch_size,), jnp.float32))
+    return Vantage(standing, zeros + config.memory_frames, zeros + config.memory_frames - 1, zeros)
 
 
 def intended(config: ModelConfig, vantage: Vantage, action: Array) -> Motion:
@@ -166,12 +166,13 @@ def empty(config: ModelConfig, batch_size: int) -> Memory | None:
     if not heads:
         return None
     lead, view = (batch_size, config.memory_frames), config.range_view
-    memory = Memory(jnp.zeros((*lead, 3)), jnp.full((*lead, view.rows, view.columns, 4), -1.0))
+    memory = Memory(jnp.zeros((*lead, 3), jnp.float32),
+                    jnp.full((*lead, view.rows, view.columns, 4), -1.0, jnp.float32))
     if "image" not in heads:
         return memory
-    return dataclasses.replace(
-        memory, image=jnp.zeros((*lead, *config.image_size, 3), jnp.uint8),
-        intrinsics=jnp.zeros((batch_size, 3, 3)), camera_to_ego=jnp.zeros((batch_size, 4, 4)))
+    return dataclasses.replace(memory, image=jnp.zeros((*lead, *config.image_size, 3), jnp.uint8),
+                               intrinsics=jnp.zeros((batch_size, 3, 3), jnp.float32),
+                               camera_to_ego=jnp.zeros((batch_size, 4, 4), jnp.float32))
 
 
 def remember(memory: Memory, batch: Batch, step: Array) -> Memory:

@@ -42,7 +42,7 @@ def splat(points_m: Array, valid: Array, geometry: RangeViewGeometry) -> Array:
     row, column, range_m = _polar(points_m, geometry)
     inside = valid & (row >= 0) & (row < geometry.rows)
     pixel = jnp.where(inside, row * geometry.columns + column, cells)
-    pixel = jax.lax.stop_gradient(pixel + (cells + 1) * jnp.arange(count)[:, None]).reshape(-1)
+    pixel = jax.lax.stop_gradient(pixel + (cells + 1) * jnp.arange(count, dtype=jnp.int32)[:, None]).reshape(-1)
     ranges = jax.lax.stop_gradient(range_m).reshape(-1)
     nearest = jnp.full((count * (cells + 1),), jnp.inf, jnp.float32).at[pixel].min(ranges)
     wins = ranges == nearest[pixel]

@@ -91,7 +91,7 @@ def train(job: Job, show: screen.Screen) -> Outcome:
         frames = pipeline.Frames(recording, config)
         source = pipeline.train_batches(frames, seed=config.train.seed, batch=windows_per_step(config))
         shapes = preparation.expected_batch(config, windows_per_step(config),
-                                            recorded=recording.description.modalities)
+                                            recorded=schema.in_every_frame(recording))
         ready = early.result()
         ready = (preparation.recompile(ready, config, shapes, job.frozen) if ready
                  else preparation.prepare(config, shapes, job.frozen))

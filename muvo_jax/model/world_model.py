@@ -113,12 +113,12 @@ class Network(linen.Module):
 
     def decode(self, features: jax.Array, vantage: Vantage | None, memory: Memory | None, rows: jax.Array | None,
                names: tuple[str, ...]) -> dict[str, dict[int, jax.Array]]:
-        glimpses = {} if memory is None else memory_lib.look(self.config, memory, rows, vantage, names)
+        glimpses, numbers = ({}, None) if memory is None else memory_lib.look(self.config, memory, rows, vantage, names)
         raw = {}
         for name in names:
             read = self.read(features, name)
             if name in glimpses:
-                raw[name] = self.decoders[name](read, glimpses[name], guided.numbers(vantage), self.first_guess[name])
+                raw[name] = self.decoders[name](read, glimpses[name], numbers, self.first_guess[name])
             else:
                 raw[name] = self.decoders[name](read)
                 if self.config.first_guess != "zero" and name in self.first_guess:
@@ -148,6 +148,13 @@ class WorldModel:
     """
 
     config: ModelConfig
+
+    def __post_init__(self):
+        config = self.config
+        if config.tracks_motion and config.kinematics is None and "ego_motion" not in config.heads:
+            raise ValueError(f"model.first_guess=last_seen moves what was seen as the car moves, but model.kinematics "
+                             f"is None and the heads are {', '.join(config.heads)}. Take the model of a Config whose "
+                             f"contract.kinematics is 'bicycle' (Config.model), or add the head ego_motion.")
 
     @property
     def feature_shape(self) -> tuple[int, ...]:

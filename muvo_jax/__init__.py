@@ -4,27 +4,57 @@
     batch = muvo_jax.windows(run, frames=6)
     observed = muvo_jax.observe(run.model, run.variables, key, batch)
     dream = muvo_jax.imagine(run.model, run.variables, key, observed.last, actions)
-    predictions = muvo_jax.decode(run.model, run.variables, dream.states, heads=("image", "occupancy"))
-    predictions.image, predictions.at_scale(2).occupancy
+    predictions = muvo_jax.decode(run.model, run.variables, dream.states, ("image",), memory=observed.memory)
+    predictions.image, predictions.at_scale(2).image
 
 Everything is a pure function of explicit pytrees, with arguments in one order: (model, variables, key, what goes in);
 see docs/design.md.
 """
 
-from muvo_jax import presets
-from muvo_jax.agents.environment import Environment
-from muvo_jax.config import Config, ModelConfig
-from muvo_jax.model.live import LiveState, observe_step, start_live
-from muvo_jax.model.rollout import decode, imagine, imagine_step, observe
-from muvo_jax.model.world_model import WorldModel
-from muvo_jax.run import Run
-from muvo_jax.types import Batch, Dream, LatentState, Observed, Predictions
+import importlib
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from muvo_jax import presets
+    from muvo_jax.agents.environment import Environment
+    from muvo_jax.config import Config, ModelConfig
+    from muvo_jax.model.live import LiveState, observe_step, start_live
+    from muvo_jax.model.rollout import decode, imagine, imagine_step, observe
+    from muvo_jax.model.world_model import WorldModel
+    from muvo_jax.run import Run
+    from muvo_jax.types import Batch, Dream, LatentState, Observed, Predictions
 
 __all__ = [
     "Batch", "Config", "Dream", "Environment", "LatentState", "LiveState", "ModelConfig", "Observed", "Predictions",
     "Run", "WorldModel", "decode", "imagine", "imagine_step", "load", "observe", "observe_step", "presets",
     "start_live", "windows",
 ]
+
+# Where names come from. Each is imported when it is first used: a command's --help needs no JAX.
+_MODULES = ("agents", "config", "geometry", "model", "nn", "ops", "presets", "types")
+_HOMES = {
+    "agents.environment": ("Environment",),
+    "config": ("Config", "ModelConfig"),
+    "model.live": ("LiveState", "observe_step", "start_live"),
+    "model.rollout": ("decode", "imagine", "imagine_step", "observe"),
+    "model.world_model": ("WorldModel",),
+    "run": ("Run",),
+    "types": ("Batch", "Dream", "LatentState", "Observed", "Predictions"),
+}
+
+
+def __getattr__(name):
+    if name in _MODULES:
+        return importlib.import_module(f"muvo_jax.{name}")
+    for home, names in _HOMES.items():
+        if name in names:
+            globals()[name] = getattr(importlib.import_module(f"muvo_jax.{home}"), name)
+            return globals()[name]
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+
+
+def __dir__():
+    return sorted({*globals(), *__all__})
 
 
 def load(run, checkpoint="latest"):

@@ -1,12 +1,14 @@
-"""python -m muvo_jax: lists the commands."""
+"""python -m muvo_jax, or muvo: lists the commands; muvo COMMAND calls one."""
 
 from __future__ import annotations
 
 import ast
 import difflib
+import importlib
 import pathlib
-import signal
 import sys
+
+from muvo_jax import command_line
 
 COMMANDS = ("train", "evaluate", "dream", "plan_drive", "doctor", "voxelize", "pack", "record_carla", "export_muvo",
             "convert", "export", "interop.export_torch", "interop.parity")
@@ -22,22 +24,39 @@ def describe(command: str) -> tuple[str, str]:
 
 
 def main() -> int:
-    """Returns 0 where nothing was asked for, else 2: commands are modules, not arguments."""
-    asked = [argument for argument in sys.argv[1:] if argument not in ("-h", "--help")]
-    if asked:
-        near = difflib.get_close_matches(asked[0], COMMANDS, n=1)
-        hint = f"did you mean python -m muvo_jax.{near[0]}?" if near else "python -m muvo_jax lists the commands."
-        print(f"error: python -m muvo_jax takes no argument, got {asked[0]}; {hint}", file=sys.stderr)
-        return 2
+    """Calls the command that the first argument names (train, plan_drive or plan-drive), or lists them all.
+
+    Returns:
+      The exit code, 2 where there is no such command.
+    """
+    if sys.argv[1:] and sys.argv[1] not in ("-h", "--help"):
+        return _call(sys.argv[1], sys.argv[2:])
     described = [describe(command) for command in COMMANDS]
     width = max(len(call) for call, _ in described)
-    print("MUVO, a multimodal generative world model for driving. Commands (each explains itself with --help):\n")
-    for call, purpose in described:
-        print(f"  {call:{width}}  {purpose}")
+    with command_line.reader_may_leave():
+        print("MUVO, a multimodal generative world model for driving. Commands (each explains itself with --help; muvo "
+              "train is\nshort for python -m muvo_jax.train):\n")
+        for call, purpose in described:
+            print(f"  {call:{width}}  {purpose}")
     return 0
 
 
+def _call(asked: str, arguments: list[str]) -> int:
+    by_name = {command.rpartition(".")[2]: command for command in COMMANDS}
+    name = asked.replace("-", "_").removeprefix("interop.")
+    if name not in by_name:
+        near = difflib.get_close_matches(name, by_name, n=1)
+        hint = f"did you mean python -m muvo_jax.{by_name[near[0]]}?" if near else f"known are {', '.join(by_name)}."
+        print(f"error: there is no command {asked}; {hint} (muvo --help)", file=sys.stderr)
+        return 2
+    module = f"muvo_jax.{by_name[name]}"
+    if name == "parity":  # a package
+        module += ".__main__"
+    if pathlib.Path(sys.argv[0]).stem == "muvo":
+        sys.argv[0] = f"muvo {name}"  # for the help
+    sys.argv[1:] = arguments
+    return importlib.import_module(module).main()
+
+
 if __name__ == "__main__":
-    if hasattr(signal, "SIGPIPE"):
-        signal.signal(signal.SIGPIPE, signal.SIG_DFL)  # no traceback from python -m muvo_jax | head -1
     sys.exit(main())

@@ -1,4 +1,7 @@
-"""What the commands share: one clear line for an expected error, the compilation cache, and opening the data."""
+"""What the commands share: flags first, one clear line for an expected error, the compilation cache, opening the data.
+
+A command imports what its work needs inside `late.imports()`, so that --help and a wrong flag answer at once.
+"""
 
 from __future__ import annotations
 
@@ -14,19 +17,25 @@ import time
 import traceback
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
-import jax
 import tyro
 
-from muvo_jax import config as config_lib
-from muvo_jax import run as run_lib
-from muvo_jax.data import schema, sources
-from muvo_jax.training import host, screen
+from muvo_jax import late
+
+with late.imports():
+    from muvo_jax.data import sources
+    from muvo_jax.training import checkpoint, host, screen
+
+if TYPE_CHECKING:
+    from muvo_jax import config as config_lib
+    from muvo_jax import run as run_lib
+    from muvo_jax.data import schema
 
 TRACEBACK_VARIABLE = "MUVO_JAX_TRACEBACK"
 EXPECTED_ERRORS = (ValueError, OSError, ArithmeticError)  # DataError, CheckpointError and NonFiniteLossError are these
 _Options = TypeVar("_Options")
+_Result = TypeVar("_Result")
 
 
 def shown(metavar: str, default: str = "preset's"):
@@ -34,8 +43,9 @@ def shown(metavar: str, default: str = "preset's"):
     return tyro.conf.arg(metavar=metavar, help_behavior_hint=f"(default: {default})")
 
 
-def run(options_type: type[_Options], work: Callable[[_Options, screen.Screen], Any], *, program: str,
-        examples: str = "", arguments: Sequence[str] | None = None) -> int:
+def run(options_type: type[_Options], work: Callable[[_Options, screen.Screen], _Result], *, program: str,
+        examples: str = "", arguments: Sequence[str] | None = None, status: Callable[[_Result], int] = lambda _: 0,
+        failed: int = 1, trains: bool = False) -> int:
     """Parses the command line and does the work.
 
     Args:
@@ -44,24 +54,30 @@ def run(options_type: type[_Options], work: Callable[[_Options, screen.Screen], 
       program: as in python -m muvo_jax.PROGRAM.
       examples: command lines for the help.
       arguments: instead of those of the process.
+      status: the exit code of what the work returns.
+      failed: the exit code of an error that was explained.
+      trains: whether the process should be one that trains fast (host.restart_with_huge_pages).
 
     Returns:
-      The exit code: 0 done, 1 an error that was explained, 130 interrupted. A wrong command line raises SystemExit(2).
+      The exit code: `status`, or `failed`, or 130 where interrupted. A wrong command line raises SystemExit(2).
     """
-    if arguments is None:
-        host.restart_with_huge_pages()
-        arguments = sys.argv[1:]
-    check_options(options_type, program, arguments)
+    given = sys.argv[1:] if arguments is None else arguments
+    check_options(options_type, program, given)
     paragraphs = [inspect.getdoc(options_type) or "", "Examples:", *examples.strip().splitlines()]
     description = "\n\n".join(paragraphs)  # the help joins lines, but not paragraphs
-    with _reader_may_leave():
-        options = tyro.cli(options_type, prog=f"python -m muvo_jax.{program}", args=arguments, description=description)
+    called = sys.argv[0] if sys.argv[0].startswith("muvo ") else f"python -m muvo_jax.{program}"
+    with reader_may_leave():
+        options = tyro.cli(options_type, prog=called, args=given, description=description)
+    check_numbers(options)
+    if trains and arguments is None:
+        host.restart_with_huge_pages()
+    use_compilation_cache()
+    late.load()
     show = screen.Screen()
     with warnings.catch_warnings():
         warnings.showwarning = lambda message, *_, **__: show.warn(str(message))  # type: ignore[assignment]
-        use_compilation_cache()
         try:
-            work(options, show)
+            return status(work(options, show))
         except EXPECTED_ERRORS as error:
             show.stop()
             if os.environ.get(TRACEBACK_VARIABLE):
@@ -69,17 +85,19 @@ def run(options_type: type[_Options], work: Callable[[_Options, screen.Screen], 
             print(f"error: {error}", file=sys.stderr)
             if not os.environ.get(TRACEBACK_VARIABLE):
                 print(f"({type(error).__name__}; {TRACEBACK_VARIABLE}=1 shows where)", file=sys.stderr)
-            return 1
+            return failed
         except KeyboardInterrupt:
             show.stop()
             print("interrupted.", file=sys.stderr)
             return 130
-    return 0
 
 
 @contextlib.contextmanager
-def _reader_may_leave() -> Iterator[None]:
-    """Ends with exit code 0 where the reader of what is printed here has seen enough, as in --help | head."""
+def reader_may_leave() -> Iterator[None]:
+    """Ends with exit code 0 where the reader of what is printed here has seen enough, as in --help | head.
+
+    Only for what does nothing but print: work goes on without its reader (screen.Screen).
+    """
     try:
         try:
             yield
@@ -105,10 +123,22 @@ def check_options(options_type: type, program: str, arguments: Sequence[str]) ->
         raise SystemExit(2)
 
 
+def check_numbers(options: Any) -> None:
+    """Ends with exit code 2 at a number that no option takes: a negative one, or no worker at all."""
+    for field in dataclasses.fields(options):
+        value = getattr(options, field.name)
+        least = int(field.name == "workers")
+        if isinstance(value, int | float) and not value >= least:
+            print(f"error: --{field.name.replace('_', '-')} is {value}; expected {least} or more", file=sys.stderr)
+            raise SystemExit(2)
+
+
 def use_compilation_cache() -> None:
-    """Keeps compiled programs in the user's cache folder, unless JAX_COMPILATION_CACHE_DIR says where."""
-    if not os.environ.get("JAX_COMPILATION_CACHE_DIR"):
-        jax.config.update("jax_compilation_cache_dir", str(cache_folder() / "jax"))
+    """Keeps compiled programs in the user's cache folder, unless JAX_COMPILATION_CACHE_DIR says where.
+
+    For a JAX that is yet to be imported: it reads the variable once.
+    """
+    os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(cache_folder() / "jax"))
 
 
 def cache_folder() -> pathlib.Path:
@@ -156,8 +186,6 @@ def load_run(run: pathlib.Path, which: str, show: screen.Screen) -> run_lib.Run:
     Raises:
       ValueError, CheckpointError: as which_checkpoint and checkpoint.load_run.
     """
-    from muvo_jax.training import checkpoint  # with Orbax, which not every command needs
-
     loaded = checkpoint.load_run(run, which_checkpoint(which))
     for text in loaded.warnings:
         show.warn(text)

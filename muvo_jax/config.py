@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import Any, Literal
+import math
+from typing import Annotated, Any, Literal
 
 from muvo_jax.config_augmentation import AugmentationConfig
 from muvo_jax.config_heads import (
@@ -17,11 +18,12 @@ from muvo_jax.config_heads import (
     head_targets,
 )
 from muvo_jax.config_json import check_choice, override, override_all, parse
-from muvo_jax.geometry import BirdsEyeGrid, PillarGrid, RangeViewGeometry, VoxelGrid
+from muvo_jax.geometry import BirdsEyeGrid, PillarGrid, RangeViewGeometry, RouteMap, VoxelGrid
+from muvo_jax.limits import COUNT, NOT_NEGATIVE, SHARE, Limits, above, at_least, between, check
 
 __all__ = ["ALL_HEADS", "BIRDS_EYE_CLASSES", "EGO_MOTION_UNITS", "HEADS", "TARGETS", "TERM_TARGETS", "ActionContract",
            "AugmentationConfig", "BirdsEyeGrid", "Config", "DataConfig", "EvaluationConfig", "LossConfig",
-           "ModelConfig", "OptimizerConfig", "PillarGrid", "RangeViewGeometry", "TrainConfig", "VoxelGrid",
+           "ModelConfig", "OptimizerConfig", "PillarGrid", "RangeViewGeometry", "RouteMap", "TrainConfig", "VoxelGrid",
            "head_targets", "override", "override_all", "parse"]
 
 FUSIONS = ("tr", "fc", "avg")
@@ -30,6 +32,10 @@ CAMERA_ENCODERS = ("wob", "bev")
 NO_SENSOR = "none"  # in place of an encoder
 LATENTS = ("1d", "2d")
 BACKBONES = ("resnet18", "mobilevitv2_100")
+RATE_HZ = above(0, 10_000, "Hz")
+STEERING_RAD = Limits(0, 0.5 * math.pi, open_low=True, open_high=True, unit="rad")
+DROPOUT = MOMENTUM = Limits(0, 1, open_high=True)
+SEED = between(0, 2**32 - 1)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -46,14 +52,17 @@ class ActionContract:
         as the reference takes it. A setting of the run; recordings say nothing of it.
     """
 
-    accel_full_mps2: float = 3.0
-    brake_full_mps2: float = 6.0
-    steer_full_rad: float = 0.6
-    wheelbase_m: float = 2.9
-    rate_hz: float = 10.0
+    accel_full_mps2: Annotated[float, above(0, 100, "m/s2")] = 3.0
+    brake_full_mps2: Annotated[float, above(0, 100, "m/s2")] = 6.0
+    steer_full_rad: Annotated[float, STEERING_RAD] = 0.6
+    wheelbase_m: Annotated[float, above(0, 30, "m")] = 2.9
+    rate_hz: Annotated[float, RATE_HZ] = 10.0
     kinematics: Literal["bicycle", "none"] = "bicycle"
     source: Literal["recorded", "derived"] = "recorded"
     step_action: Literal["mean", "first"] = "mean"
+
+    def __post_init__(self):
+        check(self)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -61,7 +70,10 @@ class Kinematics:
     """How one step of a model moves the car: the contract's bicycle for `periods` recorded periods."""
 
     contract: ActionContract = ActionContract()
-    periods: int = 1
+    periods: Annotated[int, COUNT] = 1
+
+    def __post_init__(self):
+        check(self)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -121,49 +133,49 @@ class ModelConfig:
     latent: str = "1d"
     numerics: Literal["standard", "reference"] = "standard"
     heads: tuple[str, ...] = HEADS
-    semantic_classes: int = 10
+    semantic_classes: Annotated[int, COUNT] = 10
     route: bool = True
     speed: bool = True
     route_encoder: Literal["resnet18", "small"] = "resnet18"
     navigation: bool = False
     backbone: str = "resnet18"
     many_tokens: bool = False
-    image_size: tuple[int, int] = (320, 832)
+    image_size: Annotated[tuple[int, int], COUNT] = (320, 832)
     range_view: RangeViewGeometry = RangeViewGeometry()
     voxels: VoxelGrid = VoxelGrid()
     pillars: PillarGrid = PillarGrid()
     birds_eye: BirdsEyeGrid = BirdsEyeGrid()
-    backbone_width: int = 64
-    map_channels: int = 64
-    token_channels: int = 384
-    transformer_layers: int = 6
-    transformer_heads: int = 8
-    transformer_hidden_channels: int = 2048
-    dropout: float = 0.1
-    fused_channels: int = 512
+    backbone_width: Annotated[int, COUNT] = 64
+    map_channels: Annotated[int, COUNT] = 64
+    token_channels: Annotated[int, COUNT] = 384
+    transformer_layers: Annotated[int, COUNT] = 6
+    transformer_heads: Annotated[int, COUNT] = 8
+    transformer_hidden_channels: Annotated[int, COUNT] = 2048
+    dropout: Annotated[float, DROPOUT] = 0.1
+    fused_channels: Annotated[int, COUNT] = 512
     keep_cells: bool = False
-    measurement_channels: int = 16
-    embedding_channels: int = 512
-    deterministic_channels: int = 1024
-    stochastic_channels: int = 512
-    action_channels: int = 64
-    transition_layers: int = 6
+    measurement_channels: Annotated[int, COUNT] = 16
+    embedding_channels: Annotated[int, COUNT] = 512
+    deterministic_channels: Annotated[int, COUNT] = 1024
+    stochastic_channels: Annotated[int, COUNT] = 512
+    action_channels: Annotated[int, COUNT] = 64
+    transition_layers: Annotated[int, COUNT] = 6
     aligned_tokens: bool = False
-    prior_dropout: float = 0.15
-    decoder_channels: int = 512
-    occupancy_channels: int = 64
-    occupancy_blocks: int = 3
-    occupancy_token_stages: int = 1
+    prior_dropout: Annotated[float, SHARE] = 0.15
+    decoder_channels: Annotated[int, COUNT] = 512
+    occupancy_channels: Annotated[int, COUNT] = 64
+    occupancy_blocks: Annotated[int, NOT_NEGATIVE] = 3
+    occupancy_token_stages: Annotated[int, NOT_NEGATIVE] = 1
     first_guess: Literal["zero", "training_mean", "last_seen"] = "zero"
-    memory_frames: int = 6
-    guided_channels: tuple[int, int, int] = (64, 64, 64)
+    memory_frames: Annotated[int, COUNT] = 6
+    guided_channels: Annotated[tuple[int, int, int], COUNT] = (64, 64, 64)
     action_path: Literal["prior", "recurrence"] = "prior"
     kinematics: Kinematics | None = None
     range_view_points: Literal["free", "beams"] = "free"
     compute_dtype: Literal["float32", "bfloat16"] = "float32"
     convolution: Literal["auto", "xla", "gemm"] = "auto"
-    range_scale_m: float = 50.0
-    speed_scale_mps: float = 5.0
+    range_scale_m: Annotated[float, above(0, unit="m")] = 50.0
+    speed_scale_mps: Annotated[float, above(0, unit="m/s")] = 5.0
 
     @property
     def tracks_motion(self) -> bool:
@@ -177,6 +189,7 @@ class ModelConfig:
         return f"{self.lidar}-{self.camera}-{self.fusion}".upper()
 
     def __post_init__(self):
+        check(self)
         for name, known in (("fusion", FUSIONS), ("lidar", (*LIDAR_ENCODERS, NO_SENSOR)), ("latent", LATENTS),
                             ("camera", (*CAMERA_ENCODERS, NO_SENSOR)), ("backbone", BACKBONES)):
             check_choice(f"model.{name}", getattr(self, name), known)
@@ -236,17 +249,20 @@ class OptimizerConfig:
       accumulate: micro-batches per update.
     """
 
-    learning_rate: float = 1e-4
-    weight_decay: float = 0.01
-    beta1_low: float = 0.85
-    beta1_high: float = 0.95
-    beta2: float = 0.999
-    epsilon: float = 1e-8
-    warmup_fraction: float = 0.2
-    start_divisor: float = 25.0
-    end_divisor: float = 1e4
-    clip_norm: float = 0.0
-    accumulate: int = 1
+    learning_rate: Annotated[float, above(0)] = 1e-4
+    weight_decay: Annotated[float, NOT_NEGATIVE] = 0.01
+    beta1_low: Annotated[float, MOMENTUM] = 0.85
+    beta1_high: Annotated[float, MOMENTUM] = 0.95
+    beta2: Annotated[float, MOMENTUM] = 0.999
+    epsilon: Annotated[float, above(0)] = 1e-8
+    warmup_fraction: Annotated[float, SHARE] = 0.2
+    start_divisor: Annotated[float, above(0)] = 25.0
+    end_divisor: Annotated[float, above(0)] = 1e4
+    clip_norm: Annotated[float, NOT_NEGATIVE] = 0.0
+    accumulate: Annotated[int, COUNT] = 1
+
+    def __post_init__(self):
+        check(self)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -262,26 +278,24 @@ class DataConfig:
       cache_gib: decoded frames are kept in memory up to this size.
       workers: threads that read and decode batches ahead; 0 takes one for each processor but one, 2 to 16.
       skip_corrupt_shards: leave damaged shards of a packed recording out, counted, instead of stopping.
+      route_map: scale of its route maps, and where the car stands in them; the recording says it.
     """
 
     path: str = "town"
     camera: str = ""
-    frames: int = 12
-    stride: int = 2
-    context: int = 6
-    horizon: int = 6
-    town_seed: int = 0
+    frames: Annotated[int, COUNT] = 12
+    stride: Annotated[int, COUNT] = 2
+    context: Annotated[int, COUNT] = 6
+    horizon: Annotated[int, COUNT] = 6
+    town_seed: Annotated[int, SEED] = 0
     town_size: str = "default"
-    cache_gib: float = 1.5
-    workers: int = 0
+    cache_gib: Annotated[float, NOT_NEGATIVE] = 1.5
+    workers: Annotated[int, NOT_NEGATIVE] = 0
     skip_corrupt_shards: bool = False
+    route_map: RouteMap = RouteMap()
 
     def __post_init__(self):
-        for name in ("frames", "stride", "context", "horizon"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"data.{name} is {getattr(self, name)}; it must be at least 1.")
-        if self.workers < 0:
-            raise ValueError(f"data.workers is {self.workers}; it must be at least 0 (0 chooses).")
+        check(self)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -303,28 +317,26 @@ class TrainConfig:
       perceptual_from: such a file, or a run whose image encoder is taken, for the perceptual term; "" for none.
     """
 
-    steps: int = 50_000
-    batch: int = 1
-    seed: int = 0
-    log_every: int = 10
-    validate_every: int = 1000
-    checkpoint_every: int = 1000
-    preview_every: int = 1000
-    validation_windows: int = 16
-    keep_last: int = 2
-    keep_best: int = 1
+    steps: Annotated[int, COUNT] = 50_000
+    batch: Annotated[int, COUNT] = 1
+    seed: Annotated[int, SEED] = 0
+    log_every: Annotated[int, COUNT] = 10
+    validate_every: Annotated[int, NOT_NEGATIVE] = 1000
+    checkpoint_every: Annotated[int, NOT_NEGATIVE] = 1000
+    preview_every: Annotated[int, NOT_NEGATIVE] = 1000
+    validation_windows: Annotated[int, COUNT] = 16
+    keep_last: Annotated[int, NOT_NEGATIVE] = 2
+    keep_best: Annotated[int, NOT_NEGATIVE] = 1
     parallel: Literal["auto", "pmap", "shard_map"] = "auto"
     remat: bool = False
-    decode_frames: int = 0
-    observe_frames: int = 0
+    decode_frames: Annotated[int, NOT_NEGATIVE] = 0
+    observe_frames: Annotated[int, NOT_NEGATIVE] = 0
     restart: bool = False
     backbone_weights: str = ""
     perceptual_from: str = ""
 
     def __post_init__(self):
-        for name in ("steps", "batch"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"train.{name} is {getattr(self, name)}; it must be at least 1.")
+        check(self)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -338,12 +350,15 @@ class EvaluationConfig:
       sampled: imagine with sampled latents; otherwise with their means.
     """
 
-    windows: int = 64
-    batch: int = 4
-    chamfer_points: int = 2048
-    return_threshold_m: float = 1.0
+    windows: Annotated[int, NOT_NEGATIVE] = 64
+    batch: Annotated[int, COUNT] = 4
+    chamfer_points: Annotated[int, NOT_NEGATIVE] = 2048
+    return_threshold_m: Annotated[float, at_least(0, "m")] = 1.0
     sampled: bool = False
-    seed: int = 0
+    seed: Annotated[int, SEED] = 0
+
+    def __post_init__(self):
+        check(self)
 
 
 @dataclasses.dataclass(frozen=True)

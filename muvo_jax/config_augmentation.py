@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
+from typing import Annotated
+
+from muvo_jax.limits import SHARE, above, between, check
 
 
 @dataclasses.dataclass(frozen=True)
@@ -34,35 +37,33 @@ class AugmentationConfig:
     route: bool = False
     mirror: bool = False
     light: bool = False
-    blur: float = 0.3
-    sharpen: float = 0.3
-    blur_std_px: tuple[float, float] = (0.1, 1.7)
-    sharpen_factor: tuple[float, float] = (1.0, 5.0)
-    colour: float = 0.3
-    brightness: float = 0.3
-    contrast: float = 0.3
-    saturation: float = 0.3
-    hue: float = 0.1
-    route_drop: float = 0.025
-    route_truncate: float = 0.025
-    route_affine_small: float = 0.025
-    route_affine_large: float = 0.025
-    route_rotation_deg: float = 8.0
-    route_translation: float = 0.1
-    route_scale: tuple[float, float] = (0.95, 1.05)
-    route_shear_deg: float = 0.1
+    blur: Annotated[float, SHARE] = 0.3
+    sharpen: Annotated[float, SHARE] = 0.3
+    blur_std_px: Annotated[tuple[float, float], above(0, unit="px")] = (0.1, 1.7)
+    sharpen_factor: Annotated[tuple[float, float], above(0)] = (1.0, 5.0)
+    colour: Annotated[float, SHARE] = 0.3
+    brightness: Annotated[float, SHARE] = 0.3
+    contrast: Annotated[float, SHARE] = 0.3
+    saturation: Annotated[float, SHARE] = 0.3
+    hue: Annotated[float, between(0, 0.5)] = 0.1
+    route_drop: Annotated[float, SHARE] = 0.025
+    route_truncate: Annotated[float, SHARE] = 0.025
+    route_affine_small: Annotated[float, SHARE] = 0.025
+    route_affine_large: Annotated[float, SHARE] = 0.025
+    route_rotation_deg: Annotated[float, between(0, 180, "degrees")] = 8.0
+    route_translation: Annotated[float, SHARE] = 0.1
+    route_scale: Annotated[tuple[float, float], above(0)] = (0.95, 1.05)
+    route_shear_deg: Annotated[float, between(-45, 45, "degrees")] = 0.1
 
     def __post_init__(self):
-        for names in (("blur", "sharpen"), ("colour",),
+        check(self)
+        for names in (("blur", "sharpen"),
                       ("route_drop", "route_truncate", "route_affine_small", "route_affine_large")):
             shares = [getattr(self, name) for name in names]
-            if min(shares) < 0.0 or sum(shares) > 1.0:
+            if sum(shares) > 1.0:
                 raise ValueError(f"augmentation: {' + '.join(names)} = {' + '.join(f'{share:g}' for share in shares)}; "
                                  f"probabilities lie between 0 and 1, together too.")
-        for name, most in (("brightness", 1.0), ("contrast", 1.0), ("saturation", 1.0), ("hue", 0.5)):
-            if not 0.0 <= getattr(self, name) <= most:
-                raise ValueError(f"augmentation.{name} is {getattr(self, name):g}; it must lie between 0 and {most:g}.")
         for name in ("blur_std_px", "sharpen_factor", "route_scale"):
             low, high = getattr(self, name)
-            if not 0.0 < low <= high:
-                raise ValueError(f"augmentation.{name} is {low:g} to {high:g}; expected 0 < lowest <= highest.")
+            if low > high:
+                raise ValueError(f"augmentation.{name} is {low:g} to {high:g}; expected lowest <= highest.")

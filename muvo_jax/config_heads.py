@@ -3,7 +3,8 @@
 A new head is one row in each of four places, all by the same name, and nothing else:
 
 1. TARGETS below: the Batch fields that its loss reads, each with its shape for one frame. A field that no recording had
-   so far also needs a line in types.Batch, types.BATCH_FIELDS and data/schema.RawFrame, and a reader that fills it.
+   so far also needs a line in types.Batch, types.BATCH_FIELDS, data/schema.RawFrame and the table data/fields.py, which
+   tells the plain format's reader and writer how it is stored.
 2. model/heads.TABLE: its decoder (`_vector` for a number or a few of them).
 3. objectives/terms.TABLE: its loss terms, each with the field of LossConfig that weighs it.
 4. LossConfig below: these weights.
@@ -16,7 +17,9 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Mapping
-from typing import Any, Literal, NamedTuple
+from typing import Annotated, Any, Literal, NamedTuple
+
+from muvo_jax.limits import COUNT, NOT_NEGATIVE, SHARE, above, at_least, check
 
 HEADS = ("image", "range_view", "occupancy", "action")  # of the paper; the others are optional
 BIRDS_EYE_CLASSES = 8
@@ -71,39 +74,42 @@ class LossConfig:
     `reward` is an L2, `continue_` a cross-entropy, `ego_motion` an L1 in EGO_MOTION_UNITS.
     """
 
-    image: float = 0.1
-    image_squared: float = 0.0
-    range_xyz: float = 0.1
-    range_depth: float = 0.1
-    occupancy_cross_entropy: float = 0.1
-    occupancy_semantic_scal: float = 0.1
-    occupancy_geometric_scal: float = 0.1
-    chamfer: float = 0.0
-    action: float = 1.0
-    image_similarity: float = 0.0
-    image_perceptual: float = 0.0
-    image_instance: float = 0.0
-    occupancy_dice: float = 0.0
-    depth: float = 0.1
-    semantic_image: float = 0.1
-    semantic_range_view: float = 0.1
-    birds_eye: float = 0.1
-    birds_eye_centre: float = 20.0
-    birds_eye_offset: float = 0.01
-    reward: float = 1.0
-    continue_: float = 1.0
-    ego_motion: float = 0.1
-    kl: float = 1e-3
-    kl_balance: float = 0.75
-    chamfer_points: int = 1024
-    return_threshold_m: float = 1.0
+    image: Annotated[float, NOT_NEGATIVE] = 0.1
+    image_squared: Annotated[float, NOT_NEGATIVE] = 0.0
+    range_xyz: Annotated[float, NOT_NEGATIVE] = 0.1
+    range_depth: Annotated[float, NOT_NEGATIVE] = 0.1
+    occupancy_cross_entropy: Annotated[float, NOT_NEGATIVE] = 0.1
+    occupancy_semantic_scal: Annotated[float, NOT_NEGATIVE] = 0.1
+    occupancy_geometric_scal: Annotated[float, NOT_NEGATIVE] = 0.1
+    chamfer: Annotated[float, NOT_NEGATIVE] = 0.0
+    action: Annotated[float, NOT_NEGATIVE] = 1.0
+    image_similarity: Annotated[float, NOT_NEGATIVE] = 0.0
+    image_perceptual: Annotated[float, NOT_NEGATIVE] = 0.0
+    image_instance: Annotated[float, NOT_NEGATIVE] = 0.0
+    occupancy_dice: Annotated[float, NOT_NEGATIVE] = 0.0
+    depth: Annotated[float, NOT_NEGATIVE] = 0.1
+    semantic_image: Annotated[float, NOT_NEGATIVE] = 0.1
+    semantic_range_view: Annotated[float, NOT_NEGATIVE] = 0.1
+    birds_eye: Annotated[float, NOT_NEGATIVE] = 0.1
+    birds_eye_centre: Annotated[float, NOT_NEGATIVE] = 20.0
+    birds_eye_offset: Annotated[float, NOT_NEGATIVE] = 0.01
+    reward: Annotated[float, NOT_NEGATIVE] = 1.0
+    continue_: Annotated[float, NOT_NEGATIVE] = 1.0
+    ego_motion: Annotated[float, NOT_NEGATIVE] = 0.1
+    kl: Annotated[float, NOT_NEGATIVE] = 1e-3
+    kl_balance: Annotated[float, SHARE] = 0.75
+    chamfer_points: Annotated[int, COUNT] = 1024
+    return_threshold_m: Annotated[float, at_least(0, "m")] = 1.0
     occupancy_unknown: Literal["ignore", "empty"] = "ignore"
-    occupancy_unknown_weight: float = 0.0
-    semantic_weights: tuple[float, ...] = ()
-    semantic_image_share: float = 1.0
-    semantic_range_view_share: float = 0.5
-    birds_eye_weights: tuple[float, ...] = (1.0, 1.0, 1.0, 2.0, 3.0, 1.0, 1.0, 1.0)
-    birds_eye_share: float = 0.25
+    occupancy_unknown_weight: Annotated[float, NOT_NEGATIVE] = 0.0
+    semantic_weights: Annotated[tuple[float, ...], NOT_NEGATIVE] = ()
+    semantic_image_share: Annotated[float, above(0, 1)] = 1.0
+    semantic_range_view_share: Annotated[float, above(0, 1)] = 0.5
+    birds_eye_weights: Annotated[tuple[float, ...], NOT_NEGATIVE] = (1.0, 1.0, 1.0, 2.0, 3.0, 1.0, 1.0, 1.0)
+    birds_eye_share: Annotated[float, above(0, 1)] = 0.25
+
+    def __post_init__(self):
+        check(self)
 
 
 def head_targets(head: str, model: Any, loss: LossConfig) -> dict[str, tuple[int, ...]]:

@@ -9,6 +9,8 @@ import typing
 from collections.abc import Mapping
 from typing import Any, Literal
 
+from muvo_jax.limits import RangeError
+
 
 def check_choice(what: str, value: str, known: tuple[str, ...]) -> None:
     """Raises ValueError where `value` is none of `known`, naming the nearest ones."""
@@ -23,14 +25,18 @@ def parse(cls, values: dict[str, Any], path: str):
     """Builds the config dataclass `cls` from parsed JSON or TOML; `path` names the source in messages.
 
     Raises:
-      ValueError: for an unknown field (naming the nearest known one) or a value of the wrong type.
+      ValueError: for an unknown field (naming the nearest known one), a value of the wrong type or out of its range.
     """
     if not isinstance(values, dict):
         raise ValueError(f"{path}: got {values!r}, expected the fields of {cls.__name__}.")
     hints = typing.get_type_hints(cls)
     for name in values:
         check_choice(f"{path} ({cls.__name__})", name, tuple(hints))
-    return cls(**{name: _coerce(hints[name], value, f"{path}.{name}") for name, value in values.items()})
+    fields = {name: _coerce(hints[name], value, f"{path}.{name}") for name, value in values.items()}
+    try:
+        return cls(**fields)
+    except RangeError as error:
+        raise ValueError(f"{path}.{error.field}{error.problem}") from error
 
 
 def override(config, dotted: str, value: Any):

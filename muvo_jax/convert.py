@@ -14,10 +14,13 @@ from typing import Annotated, Any
 import numpy as np
 import tyro
 
-from muvo_jax import command_line, presets
-from muvo_jax import config as config_lib
-from muvo_jax.interop import checkpoints, names
-from muvo_jax.training import checkpoint, run_folder, screen
+from muvo_jax import command_line, late
+
+with late.imports():
+    from muvo_jax import config as config_lib
+    from muvo_jax import presets
+    from muvo_jax.interop import checkpoints, names
+    from muvo_jax.training import checkpoint, run_folder, screen
 
 REPORT_FILE = "conversion.json"
 

@@ -11,30 +11,35 @@ from typing import Annotated
 import numpy as np
 import tyro
 
-from muvo_jax import command_line
-from muvo_jax import config as config_lib
-from muvo_jax.data import checkup, schema, sources
-from muvo_jax.ops import voxels as voxel_ops
-from muvo_jax.training import screen
-from muvo_jax.viz import canvas, checks
+from muvo_jax import command_line, late
+
+with late.imports():
+    from muvo_jax import config as config_lib
+    from muvo_jax import presets
+    from muvo_jax.data import checkup, files, prepare, schema, sources, words
+    from muvo_jax.ops import voxels as voxel_ops
+    from muvo_jax.training import screen
+    from muvo_jax.viz import canvas, checks
 
 
 @dataclasses.dataclass(frozen=True)
 class Options:
     """Looks a recording over before anything is trained on it: sensors, gaps, damaged files, actions, alignment.
 
-    Works on every format that training does. Writes report.md and pictures; ends with exit code 1 where something
-    should be mended.
+    Works on every format that training does, and opens labels too. Writes report.md and pictures; ends with 0 where all
+    is well, with 1 where something should be mended and with 2 where it could not look.
     """
 
     path: Annotated[pathlib.Path, tyro.conf.Positional, tyro.conf.arg(metavar="PATH")]
     """Folder of a recording."""
     out: Annotated[pathlib.Path | None, command_line.shown("FOLDER", "doctor/NAME")] = None
-    """Where the report goes."""
+    """Where the report goes; NAME is that of the folder."""
     camera: Annotated[str, command_line.shown("NAME", "the reader's choice")] = ""
     """Which camera, where the recording has several (KITTI: image_00 to image_03)."""
     frames: int = 600
     """How many frames to read, spread over the recording; 0 reads all."""
+    workers: Annotated[int | None, command_line.shown("N", "one a processor")] = None
+    """How many stretches of frames are read side by side, each by a thread."""
 
 
 EXAMPLES = """
@@ -44,28 +49,27 @@ python -m muvo_jax.doctor recordings/mine --out=look
 """
 
 
-class RecordingProblems(ValueError):
-    """Problems were found; they have been told already."""
-
-
 def examine(options: Options, show: screen.Screen) -> checkup.Checkup:
     """Does what the command line asks for.
 
     Raises:
       DataError: where the folder is no recording.
-      RecordingProblems: where something should be mended, after everything has been written.
     """
     kind = sources.recognise(options.path, camera=options.camera)
+    name = options.path.expanduser().resolve().name or "recording"
     try:
         recording, warned = open_recording(options.path, options.camera)
     except schema.DataError as error:
-        described, name = None, options.path.expanduser().resolve().name
-        result = checkup.refused(f"{name} ({kind.name})", error)
+        described, result = None, checkup.refused(f"{name} ({kind.name})", error)
     else:
-        described, name = recording.description, recording.description.name
+        described = recording.description
+        problems, gaps = ([text for category, text in warned if issubclass(category, files.GapWarning) == is_gap]
+                          for is_gap in (False, True))
         with show.counter("looking at", "frames") as progress:
-            result = checkup.examine(recording, warned, frames=options.frames, progress=progress)
-    out = options.out or pathlib.Path("doctor") / name.split(",")[0]
+            result = checkup.examine(recording, problems, frames=options.frames, workers=options.workers, gaps=gaps,
+                                     progress=progress)
+        result = result.with_problems(refusals(recording, result))
+    out = (options.out or pathlib.Path("doctor") / name).expanduser()
     for fact, value in result.facts.items():
         show.field(fact, value)
     for finding in result.findings:
@@ -73,18 +77,30 @@ def examine(options: Options, show: screen.Screen) -> checkup.Checkup:
     pictures = draw(described, result, out) if described is not None else []
     for path in (write_report(out, result, pictures), *pictures):
         show.line(f"wrote {path}")
-    if result.problems:
-        raise RecordingProblems(f"{result.problems} problems found in {options.path}; see {out / 'report.md'}")
-    show.line("no problem found.")
+    show.line(f"{words.counted(result.problems, 'problem')} found in {options.path}; see {out / 'report.md'}."
+              if result.problems else "no problem found.", style="bold")
     return result
 
 
-def open_recording(path: pathlib.Path, camera: str = "") -> tuple[schema.Recording, list[str]]:
-    """The recording and what opening it warned of."""
+def open_recording(path: pathlib.Path, camera: str = "") -> tuple[schema.Recording, list[tuple[type[Warning], str]]]:
+    """The recording with every label it holds, and what opening it warned of."""
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        recording = sources.open_recording(path, camera=camera)
-    return recording, [str(warning.message) for warning in caught if issubclass(warning.category, schema.DataWarning)]
+        recording = sources.open_recording(path, camera=camera, labels=schema.LABELS)
+    return recording, [(warning.category, str(warning.message)) for warning in caught
+                       if issubclass(warning.category, schema.DataWarning)]
+
+
+def refusals(recording: schema.Recording, result: checkup.Checkup) -> list[str]:
+    """Why training would not take the recording as it is; empty where it would."""
+    try:
+        config = prepare.adapt(presets.get("town"), recording).config
+        prepare.check_targets(config, recording.description)
+        for sample in result.pictures:
+            prepare.prepare_frame(sample.frame, config)
+    except ValueError as error:  # DataError too
+        return [f"python -m muvo_jax.train --data refuses it: {error}"]
+    return []
 
 
 def draw(described: schema.RecordingDescription, result: checkup.Checkup, out: pathlib.Path) -> list[pathlib.Path]:
@@ -148,7 +164,8 @@ def write_report(out: pathlib.Path, result: checkup.Checkup, pictures: list[path
 
 
 def main() -> int:
-    return command_line.run(Options, examine, program="doctor", examples=EXAMPLES)
+    return command_line.run(Options, examine, program="doctor", examples=EXAMPLES, failed=2,
+                            status=lambda result: int(bool(result.problems)))
 
 
 if __name__ == "__main__":

@@ -7,19 +7,22 @@ import pathlib
 import sys
 from typing import Annotated
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 import tyro
 
-from muvo_jax import command_line, evaluate, types
-from muvo_jax import config as config_lib
-from muvo_jax.data import pipeline, schema, windows
-from muvo_jax.data import prepare as prepare_lib
-from muvo_jax.metrics import protocol, warp
-from muvo_jax.model import rollout, world_model
-from muvo_jax.training import screen
-from muvo_jax.viz import sheets
+from muvo_jax import command_line, late
+
+with late.imports():
+    import jax
+
+    from muvo_jax import config as config_lib
+    from muvo_jax import evaluate, types
+    from muvo_jax.data import pipeline, schema, windows
+    from muvo_jax.data import prepare as prepare_lib
+    from muvo_jax.metrics import protocol, warp
+    from muvo_jax.model import rollout, world_model
+    from muvo_jax.training import screen
+    from muvo_jax.viz import sheets
 
 MOST_COLUMNS = 3  # predictions beside the truth in one animation
 
@@ -74,7 +77,7 @@ def dream(options: Options, show: screen.Screen) -> list[pathlib.Path]:
     config = evaluate.fit(config, recording, tuple(chosen))
     window = choose_window(recording, config, options)
     batch = pipeline.Frames(recording, config).batch([window], judged=True)
-    futures = dream_window(loaded.model, loaded.variables, jax.random.key(options.seed), batch,
+    futures = dream_window(world_model.WorldModel(config.model), loaded.variables, jax.random.key(options.seed), batch,
                            context=config.data.context, horizon=config.data.horizon, branches=options.branches)
     labels = ["world model"] if options.branches == 1 else [f"future {index + 1}" for index in range(len(futures))]
     views = {label: sheets.views_of_frames(frames, 0)
@@ -101,7 +104,8 @@ def choose_window(recording: schema.Recording, config: config_lib.Config, option
     if split not in description.splits:
         raise ValueError(f"--split: {description.name!r} has no split {split!r}; it has "
                          f"{', '.join(description.splits)}.")
-    sequences = [sequence for sequence in recording.sequences if sequence.split == split]
+    needs = prepare_lib.needed(config, description.modalities)
+    sequences = [sequence for sequence in recording.sequences if sequence.split == split and sequence.has(needs)]
     named = [sequence for sequence in sequences if options.sequence in (None, sequence.name)]
     if not named:
         known = ", ".join(sorted({sequence.name for sequence in sequences})[:12])
@@ -134,12 +138,12 @@ def dream_window(model: world_model.WorldModel, variables: types.Variables, key:
     sampled = branches > 1
     heads = protocol.shown_heads(model.config)
     observed = rollout.observe(model, variables, key, batch.time_slice(0, context), sampled=False)
-    actions = jnp.asarray(batch.action)[:, context - 1 : context + horizon - 1]
+    actions = jax.numpy.asarray(batch.action)[:, context - 1 : context + horizon - 1]
     imagined = rollout.imagine(model, variables, key, observed.last, actions, branches=branches, sampled=sampled)
     futures = []
     for branch in range(branches):
-        states = jax.tree.map(lambda seen, dreamt, branch=branch: jnp.concatenate([seen, dreamt[:, branch]], axis=1),
-                              observed.states, imagined.states)
+        join = lambda seen, dreamt, branch=branch: jax.numpy.concatenate([seen, dreamt[:, branch]], axis=1)
+        states = jax.tree.map(join, observed.states, imagined.states)
         decoded = rollout.decode(model, variables, states, heads, memory=observed.memory)
         futures.append(jax.device_get(protocol.finish(decoded)))
     return futures

@@ -7,14 +7,19 @@ import pathlib
 import sys
 from typing import Annotated, Any
 
-import jax
 import tyro
 
-from muvo_jax import command_line, evaluation_report
-from muvo_jax import config as config_lib
-from muvo_jax.data import pipeline, prepare
-from muvo_jax.metrics import protocol
-from muvo_jax.training import checkpoint_meta, screen, validation
+from muvo_jax import command_line, late
+
+with late.imports():
+    import jax
+
+    from muvo_jax import config as config_lib
+    from muvo_jax import evaluation_report
+    from muvo_jax.data import pipeline, prepare
+    from muvo_jax.metrics import protocol
+    from muvo_jax.model import world_model
+    from muvo_jax.training import checkpoint_meta, screen, validation
 
 
 @dataclasses.dataclass(frozen=True)
@@ -75,7 +80,7 @@ def evaluate(options: Options, show: screen.Screen) -> dict[str, Any]:
         "training_mean_frames": mean_frames, "packages": checkpoint_meta.package_versions(), "splits": {}}
     for split in splits:
         show.line(f"evaluating {split} ...", style="dim")
-        scores = protocol.evaluate(loaded.model, loaded.variables,
+        scores = protocol.evaluate(world_model.WorldModel(config.model), loaded.variables,
                                    validation.windows(frames, split, config.evaluation.windows), config, mean)
         report["splits"][split] = scores
         for phase in protocol.PHASES:

@@ -20,21 +20,25 @@ import sys
 from collections.abc import Callable, Mapping
 from typing import Annotated, Any
 
-import jax
-import jax.export
-import jax.numpy as jnp
 import numpy as np
 import tyro
 
-from muvo_jax import command_line, types
-from muvo_jax import config as config_lib
-from muvo_jax.model import live as live_lib
-from muvo_jax.model import memory as memory_lib
-from muvo_jax.model import rollout, world_model
-from muvo_jax.training import screen
+from muvo_jax import command_line, late
+
+with late.imports():
+    import jax
+
+    from muvo_jax import config as config_lib
+    from muvo_jax import types
+    from muvo_jax.interop import safetensors_file
+    from muvo_jax.model import live as live_lib
+    from muvo_jax.model import memory as memory_lib
+    from muvo_jax.model import rollout, world_model
+    from muvo_jax.training import screen
 
 PLATFORMS = ("cpu", "cuda")
 SIGNATURES = "signatures.json"
+WEIGHTS = "weights.safetensors"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -66,9 +70,8 @@ def export(options: Options, show: screen.Screen) -> list[pathlib.Path]:
     Raises:
       ValueError: if OUT holds something, the horizon is below 1, or a library of the extra is missing.
     """
-    for library in ("flatbuffers", "safetensors"):
-        if importlib.util.find_spec(library) is None:
-            raise ValueError(f"export needs {library}: pip install 'muvo_jax[export]'")
+    if importlib.util.find_spec("flatbuffers") is None:
+        raise ValueError("export needs flatbuffers: pip install 'muvo_jax[export]'")
     if options.out.exists() and any(options.out.iterdir()):
         raise ValueError(f"OUT: {options.out} is not empty; name a new folder.")
     loaded = command_line.load_run(options.run, options.checkpoint, show)
@@ -86,8 +89,6 @@ def seal(model: world_model.WorldModel, variables: types.Variables, config: conf
     Raises:
       ValueError: for a horizon below 1.
     """
-    import safetensors.numpy
-
     if horizon < 1:
         raise ValueError(f"horizon is {horizon}; it must be at least 1.")
     out.mkdir(parents=True, exist_ok=True)
@@ -100,7 +101,6 @@ def seal(model: world_model.WorldModel, variables: types.Variables, config: conf
         contents[f"{name}.bin"] = bytes(exported.serialize())
         signatures[name] = {"arguments": [_describe(argument) for argument in arguments[1:]],
                             "result": _describe(jax.tree.unflatten(exported.out_tree, exported.out_avals))}
-    contents["weights.safetensors"] = safetensors.numpy.save(weights)
     contents["config.json"] = json.dumps(config.to_dict(), indent=2).encode()
     contents["contract.json"] = json.dumps(
         {**dataclasses.asdict(config.contract), "stride": config.data.stride}, indent=2).encode()
@@ -109,7 +109,8 @@ def seal(model: world_model.WorldModel, variables: types.Variables, config: conf
                                       indent=2).encode()
     for name, content in contents.items():
         (out / name).write_bytes(content)
-    return [out / name for name in contents]
+    safetensors_file.save(out / WEIGHTS, weights)
+    return [*(out / name for name in contents), out / WEIGHTS]
 
 
 def functions(model: world_model.WorldModel, weights: Mapping[str, Any], config: config_lib.Config,
@@ -121,8 +122,8 @@ def functions(model: world_model.WorldModel, weights: Mapping[str, Any], config:
     remembered = lambda arrays: {f"memory/{name}": leaf for name, leaf in arrays.items()}
     described = lambda tree: {name: array(leaf.dtype, *leaf.shape[1:]) for name, leaf in to_arrays(tree).items()}
     state, memory = described(model.initial_state(1)), described(memory_lib.empty(model.config, 1))
-    keys = array(jnp.uint32, *jax.random.key_data(jax.random.key(0)).shape)
-    live = {**state, **remembered(memory), "keys": keys, "frame": array(jnp.int32)}
+    keys = array(jax.numpy.uint32, *jax.random.key_data(jax.random.key(0)).shape)
+    live = {**state, **remembered(memory), "keys": keys, "frame": array(jax.numpy.int32)}
     observation = {name: array(leaf.dtype, *leaf.shape) for name, leaf in inputs(config).items()}
 
     def observe_step(weights, live, observation, previous_action):
@@ -142,10 +143,10 @@ def functions(model: world_model.WorldModel, weights: Mapping[str, Any], config:
         memory = None if memory is None else types.Memory(**memory)
         return rollout.decode(model, unflatten(weights), state_of(state), (head,), memory=memory)[head]
 
-    temperature = jax.ShapeDtypeStruct((), jnp.float32)
+    temperature = jax.ShapeDtypeStruct((), jax.numpy.float32)
     made: dict[str, tuple[Callable, tuple]] = {
-        "observe_step": (observe_step, (flat, live, observation, array(jnp.float32, 2))),
-        "imagine": (imagine, (flat, keys, state, array(jnp.float32, horizon, 2), temperature))}
+        "observe_step": (observe_step, (flat, live, observation, array(jax.numpy.float32, 2))),
+        "imagine": (imagine, (flat, keys, state, array(jax.numpy.float32, horizon, 2), temperature))}
     for head in model.config.heads:
         looks = (memory,) if head in memory_lib.guessed_heads(model.config) else ()
         made[f"decode_{head}"] = (functools.partial(decode, head), (flat, state, *looks))

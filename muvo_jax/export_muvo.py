@@ -9,9 +9,11 @@ from typing import Annotated
 
 import tyro
 
-from muvo_jax import command_line
-from muvo_jax.data import muvo_export
-from muvo_jax.training import screen
+from muvo_jax import command_line, late
+
+with late.imports():
+    from muvo_jax.data import muvo_export, words
+    from muvo_jax.training import screen
 
 
 @dataclasses.dataclass(frozen=True)
@@ -39,7 +41,7 @@ def export(options: Options, show: screen.Screen) -> None:
     """Does what the command line asks for."""
     with show.counter("writing", "frames") as progress:
         count = muvo_export.export(options.source, options.out, town=options.town, progress=progress)
-    show.line(f"wrote {count} frames to {options.out}.")
+    show.line(f"wrote {words.counted(count, 'frame')} to {options.out}.")
 
 
 def main() -> int:

@@ -3,6 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
+import math
+from typing import Annotated
+
+from muvo_jax.limits import COUNT, NOT_NEGATIVE, RangeError, above, between, check
+
+ELEVATION_RAD = between(-0.5 * math.pi, 0.5 * math.pi, "rad")
+MOUNTING_M = between(-30, 30, "m")  # of a sensor on a car or truck
 
 
 @dataclasses.dataclass(frozen=True)
@@ -15,20 +22,30 @@ class RangeViewGeometry:
       position_m: where the lidar sits in the ego frame.
     """
 
-    rows: int = 64
-    columns: int = 1024
-    elevation_min_rad: float = -0.5235987755982988  # -30 degrees
-    elevation_max_rad: float = 0.17453292519943295  # +10 degrees
-    position_m: tuple[float, float, float] = (1.0, 0.0, 2.0)
+    rows: Annotated[int, COUNT] = 64
+    columns: Annotated[int, COUNT] = 1024
+    elevation_min_rad: Annotated[float, ELEVATION_RAD] = -0.5235987755982988  # -30 degrees
+    elevation_max_rad: Annotated[float, ELEVATION_RAD] = 0.17453292519943295  # +10 degrees
+    position_m: Annotated[tuple[float, float, float], MOUNTING_M] = (1.0, 0.0, 2.0)
+
+    def __post_init__(self):
+        check(self)
+        if self.elevation_min_rad >= self.elevation_max_rad:
+            raise RangeError("RangeViewGeometry", "elevation_min_rad",
+                             f"is {self.elevation_min_rad:g}; it must be below elevation_max_rad, "
+                             f"{self.elevation_max_rad:g}.")
 
 
 @dataclasses.dataclass(frozen=True)
 class VoxelGrid:
     """A box of cubic voxels in the ego frame; `origin_m` is its lower corner."""
 
-    shape: tuple[int, int, int] = (192, 192, 64)
-    voxel_size_m: float = 0.5
-    origin_m: tuple[float, float, float] = (-48.0, -48.0, -6.0)
+    shape: Annotated[tuple[int, int, int], COUNT] = (192, 192, 64)
+    voxel_size_m: Annotated[float, above(0, 1000, "m")] = 0.5
+    origin_m: Annotated[tuple[float, float, float], between(-1e5, 1e5, "m")] = (-48.0, -48.0, -6.0)
+
+    def __post_init__(self):
+        check(self)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -41,10 +58,13 @@ class PillarGrid:
       channels: of a pillar.
     """
 
-    half_side_m: float = 48.0
-    cells_per_m: float = 5.0
-    points: int = 60_000
-    channels: int = 32
+    half_side_m: Annotated[float, above(0, unit="m")] = 48.0
+    cells_per_m: Annotated[float, above(0)] = 5.0
+    points: Annotated[int, COUNT] = 60_000
+    channels: Annotated[int, COUNT] = 32
+
+    def __post_init__(self):
+        check(self)
 
     @property
     def cells(self) -> int:
@@ -65,9 +85,27 @@ class BirdsEyeGrid:
       hidden_channels: between the two convolutions that shrink the map to cells / 4 tokens a side.
     """
 
-    cells: int = 48
-    cell_m: float = 0.8
-    cells_behind: int = 8
-    depth_bins: int = 37
-    lifted_bins: int = 10
-    hidden_channels: int = 512
+    cells: Annotated[int, COUNT] = 48
+    cell_m: Annotated[float, above(0, unit="m")] = 0.8
+    cells_behind: Annotated[int, NOT_NEGATIVE] = 8
+    depth_bins: Annotated[int, COUNT] = 37
+    lifted_bins: Annotated[int, COUNT] = 10
+    hidden_channels: Annotated[int, COUNT] = 512
+
+    def __post_init__(self):
+        check(self)
+
+
+@dataclasses.dataclass(frozen=True)
+class RouteMap:
+    """Geometry of Batch.route_map: the car is in row `ego_row`, column `ego_column`, looking towards row 0.
+
+    Places are continuous: pixel i covers [i, i + 1).
+    """
+
+    metres_per_px: Annotated[float, above(0, 100, "m")] = 0.75
+    ego_row: Annotated[float, between(-1000, 1000, "px")] = 48.0
+    ego_column: Annotated[float, between(-1000, 1000, "px")] = 32.0
+
+    def __post_init__(self):
+        check(self)

@@ -11,21 +11,25 @@ import time
 from collections.abc import Sequence
 from typing import Annotated, Any, Literal
 
-import jax
 import numpy as np
 import rich.table
 import tyro
 
-from muvo_jax import command_line, evaluation_report, types
-from muvo_jax import config as config_lib
-from muvo_jax import run as run_lib
-from muvo_jax.agents import closed_loop, environment, planners, rewards, sensitivity
-from muvo_jax.data import prepare
-from muvo_jax.data.town import record, settings, simulator
-from muvo_jax.metrics import protocol, warp
-from muvo_jax.model import rollout
-from muvo_jax.training import checkpoint_meta, screen
-from muvo_jax.viz import canvas, sheets
+from muvo_jax import command_line, late
+
+with late.imports():
+    import jax
+
+    from muvo_jax import config as config_lib
+    from muvo_jax import evaluation_report, types
+    from muvo_jax import run as run_lib
+    from muvo_jax.agents import closed_loop, environment, planners, rewards, sensitivity
+    from muvo_jax.data import prepare, words
+    from muvo_jax.data.town import record, settings, simulator
+    from muvo_jax.metrics import protocol, warp
+    from muvo_jax.model import rollout
+    from muvo_jax.training import checkpoint_meta, screen
+    from muvo_jax.viz import canvas, sheets
 
 FIRST_SEED = 5_000  # no recorded drive has these seeds
 COASTING = (0.0, 0.0)
@@ -97,7 +101,8 @@ def plan_drive(options: Options, show: screen.Screen) -> dict[str, Any]:
         for seed in seeds:
             key = jax.random.fold_in(jax.random.key(options.seed), seed)
             drives[name].append(closed_loop.drive(world, driver, key, seed, steps, context=context))
-        show.line(f"{name}: {len(seeds)} drives, {time.perf_counter() - began_s:.0f} s so far", style="dim")
+        show.line(f"{name}: {words.counted(len(seeds), 'drive')}, {time.perf_counter() - began_s:.0f} s so far",
+                  style="dim")
     scores = closed_loop.summarise(drives, EXPERT, town.config.route_m)
     answers = sensitivity.measure(world, lambda state: town_truth(town, state), loaded.model, loaded.variables,
                                   jax.random.key(options.seed), seeds, horizons=contrast_horizons(config),
@@ -242,8 +247,8 @@ def rows(scores) -> list[list[str]]:
 
 def screen_table(scores, options: Options) -> rich.table.Table:
     """A row for each driver."""
-    table = rich.table.Table(title=f"{options.episodes} drives of {options.seconds:g} s, {options.planner}",
-                             title_justify="left")
+    drives = words.counted(options.episodes, "drive")
+    table = rich.table.Table(title=f"{drives} of {options.seconds:g} s, {options.planner}", title_justify="left")
     for name in ("driver", *(label for label, _ in COLUMNS.values())):
         table.add_column(name, justify="left" if name == "driver" else "right")
     for row in rows(scores):
@@ -265,8 +270,9 @@ def markdown(report) -> str:
     """The report as a page."""
     lines = [f"# {pathlib.Path(report['run']).name}: driving by imagination", "",
              f"Step {report['step']}; {report['planner']}, {report['horizon']} steps of {report['step_s']:g} s, "
-             f"{report['plans']} plans, {report['iterations']} iterations. {len(report['seeds'])} drives of "
-             f"{report['seconds']:g} s with the seeds {', '.join(map(str, report['seeds']))}.", "",
+             f"{report['plans']} plans, {report['iterations']} iterations. "
+             f"{words.counted(len(report['seeds']), 'drive')} of {report['seconds']:g} s with the seeds "
+             f"{', '.join(map(str, report['seeds']))}.", "",
              "| driver | " + " | ".join(label for label, _ in COLUMNS.values()) + " |",
              "|---|" + "---:|" * len(COLUMNS)]
     lines += ["| " + " | ".join(row) + " |" for row in rows(report["scores"])]

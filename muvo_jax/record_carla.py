@@ -9,9 +9,11 @@ from typing import Annotated
 
 import tyro
 
-from muvo_jax import command_line
-from muvo_jax.data import carla_client, carla_drives, carla_recorder, voxelizing
-from muvo_jax.training import screen
+from muvo_jax import command_line, late
+
+with late.imports():
+    from muvo_jax.data import carla_client, carla_drives, carla_recorder, voxelizing, words
+    from muvo_jax.training import screen
 
 
 @dataclasses.dataclass(frozen=True)
@@ -73,7 +75,7 @@ def record(options: Options, show: screen.Screen) -> None:
     if options.occupancy:
         with show.counter("voxelizing", "frames") as progress:
             voxelizing.voxelize(options.out, progress=progress)
-    show.line(f"{len(jobs)} runs are complete in {options.out}.")
+    show.line(f"complete in {options.out}: {words.counted(len(jobs), 'run')}.")
 
 
 def _drive(options: Options, show: screen.Screen, settings: carla_drives.Settings,

@@ -13,13 +13,16 @@ from typing import Annotated, Any
 import numpy as np
 import tyro
 
-from muvo_jax import command_line, config_json, dream, evaluate, presets
-from muvo_jax import config as config_lib
-from muvo_jax.interop import backbones
-from muvo_jax.metrics import protocol
-from muvo_jax.objectives import perceptual
-from muvo_jax.training import checkpoint, loop, run_folder, screen, start, validation
-from muvo_jax.viz import curves, sheets
+from muvo_jax import command_line, late
+
+with late.imports():
+    from muvo_jax import config as config_lib
+    from muvo_jax import config_json, dream, evaluate, presets
+    from muvo_jax.interop import backbones
+    from muvo_jax.metrics import protocol
+    from muvo_jax.objectives import perceptual
+    from muvo_jax.training import checkpoint, loop, run_folder, screen, start, validation
+    from muvo_jax.viz import curves, sheets
 
 PERCEPTUAL_WEIGHT = 0.1  # the reference's
 # Flags that change one field of the configuration.
@@ -80,7 +83,7 @@ class Options:
     data_camera: Annotated[str | None, command_line.shown("NAME", "the reader's choice")] = None
     """Which camera of the recording, where it has several (KITTI: image_00 to image_03)."""
     workers: Annotated[int | None, command_line.shown("N", "one a processor but one, 2 to 16")] = None
-    """Threads that read and decode ahead."""
+    """How many batches are read and decoded side by side, each by a thread."""
     name: Annotated[str | None, command_line.shown("NAME", "made of data, preset and fusion")] = None
     """Of the run."""
     runs_dir: pathlib.Path = pathlib.Path("runs")
@@ -225,7 +228,7 @@ def frozen_encoder(config: config_lib.Config) -> perceptual.FrozenEncoder | None
     if not config.train.perceptual_from:
         raise ValueError("loss.image_perceptual is on, but train.perceptual_from names no network. Give --perceptual "
                          "with --backbone-weights=PATH or --perceptual-from=RUN.")
-    path = pathlib.Path(config.train.perceptual_from)
+    path = pathlib.Path(config.train.perceptual_from).expanduser()
     if not path.is_dir():
         return backbones.frozen_encoder(backbones.read(path))
     loaded = checkpoint.load_run(path)
@@ -331,7 +334,7 @@ def draw_curves(folder: pathlib.Path) -> None:
 
 
 def main() -> int:
-    return command_line.run(Options, train, program="train", examples=EXAMPLES)
+    return command_line.run(Options, train, program="train", examples=EXAMPLES, trains=True)
 
 
 if __name__ == "__main__":

@@ -10,9 +10,11 @@ from typing import Annotated, Literal
 
 import tyro
 
-from muvo_jax import command_line
-from muvo_jax.data import voxelizing
-from muvo_jax.training import screen
+from muvo_jax import command_line, late
+
+with late.imports():
+    from muvo_jax.data import voxelizing, words
+    from muvo_jax.training import screen
 
 _EXAMPLES = """
 python -m muvo_jax.voxelize recordings/my_car
@@ -34,8 +36,8 @@ class Options:
     hit counts as empty."""
     overwrite: bool = False
     """Remove the files that are there and make all anew; otherwise they are kept."""
-    workers: Annotated[int | None, command_line.shown("INT", "one a processor")] = None
-    """Number of processes."""
+    workers: Annotated[int | None, command_line.shown("N", "one a processor")] = None
+    """How many frames are made side by side, each by a process."""
 
 
 def voxelize(options: Options, show: screen.Screen) -> None:
@@ -44,7 +46,7 @@ def voxelize(options: Options, show: screen.Screen) -> None:
     with show.counter("voxelizing", "frames") as progress:
         result = voxelizing.voxelize(options.path.expanduser(), rule=options.rule, overwrite=options.overwrite,
                                      workers=options.workers, progress=progress)
-    show.line(f"{result.made} frames made, {result.kept} were there and are kept, after "
+    show.line(f"{words.counted(result.made, 'frame')} made, {result.kept} were there and are kept, after "
               f"{time.perf_counter() - start_s:.1f} s: {options.path}")
 
 

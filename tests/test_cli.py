@@ -1,10 +1,13 @@
 """The commands as a user meets them: help, wrong options, and one clear line for an expected error."""
 
+import contextlib
 import importlib
 import io
 import json
 import os
 import pathlib
+import re
+import resource
 import subprocess
 import sys
 import types
@@ -15,6 +18,7 @@ import muvo_jax
 from muvo_jax import __main__ as listing
 from muvo_jax import command_line, evaluate, evaluation_report, presets, train
 from muvo_jax import config as config_lib
+from muvo_jax.data import words
 from muvo_jax.training import host, run_folder, screen
 
 ROOT = pathlib.Path(muvo_jax.__file__).parents[1]
@@ -77,6 +81,72 @@ def test_the_package_alone_lists_every_command(capsys, monkeypatch):
     lines = capsys.readouterr().out.splitlines()
     for command in listing.COMMANDS:
         assert sum(line.startswith(f"  python -m muvo_jax.{command} ") for line in lines) == 1
+
+
+def test_the_readme_lists_every_command():
+    table = (ROOT / "README.md").read_text(encoding="utf-8").partition("\n## Commands\n")[2].partition("\n## ")[0]
+    for command in listing.COMMANDS:
+        assert re.search(rf"^\| `python -m muvo_jax\.{re.escape(command)} ", table, re.MULTILINE), command
+
+
+@pytest.mark.parametrize("command", listing.COMMANDS)
+def test_help_costs_less_than_a_second_and_a_half_of_processor_time(command):
+    before = resource.getrusage(resource.RUSAGE_CHILDREN)
+    done = _command(f"muvo_jax.{command}", "--help")
+    after = resource.getrusage(resource.RUSAGE_CHILDREN)
+    assert done.returncode == 0 and "Examples:" in done.stdout
+    assert after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime < 1.5
+
+
+@pytest.mark.parametrize("called", ["plan_drive", "plan-drive", "interop.export_torch", "export-torch"])
+def test_a_command_is_called_by_its_name(called, capsys, monkeypatch):
+    monkeypatch.setattr(sys, "argv", ["/usr/bin/muvo", called, "--help"])
+    with pytest.raises(SystemExit) as ended:
+        listing.main()
+    name = called.replace("-", "_").removeprefix("interop.")
+    assert ended.value.code == 0 and f"usage: muvo {name} " in capsys.readouterr().out
+
+
+def test_only_training_starts_the_process_anew_and_only_once_the_flags_are_right(monkeypatch, capsys, tmp_path):
+    restarts = []
+    monkeypatch.setattr(host, "restart_with_huge_pages", lambda: restarts.append(sys.argv[1]))
+    for module, option in ((train, "--help"), (train, "--batch=-1"), (train, "--prest=tiny"), (train, "--preset=towm"),
+                           (evaluate, str(tmp_path))):
+        monkeypatch.setattr(sys, "argv", ["muvo", option])
+        with contextlib.suppress(SystemExit):
+            module.main()
+    assert restarts == ["--preset=towm"]
+
+
+@pytest.mark.parametrize(("command", "option"), [
+    ("train", "--steps=-1"), ("train", "--workers=0"), ("doctor", "--frames=-1"), ("dream", "--branches=-2"),
+    ("plan_drive", "--episodes=-1"), ("plan_drive", "--seconds=-1"), ("record_carla", "--vehicles=-1"),
+    ("pack", "--frames-per-shard=-5"), ("pack", "--workers=-1"), ("voxelize", "--workers=0"),
+    ("evaluate", "--windows=-1")])
+def test_a_count_below_zero_is_a_wrong_command_line(command, option, capsys, monkeypatch):
+    positional = {"pack": ["a", "b"]}.get(command, [] if command == "train" else ["a"])
+    monkeypatch.setattr(sys, "argv", ["muvo", *positional, option])
+    with pytest.raises(SystemExit) as ended:
+        _module(command).main()
+    flag, _, value = option.partition("=")
+    assert ended.value.code == 2 and f"{flag} is {float(value):g}" in capsys.readouterr().err.replace(".0", "")
+
+
+def test_work_goes_on_when_the_reader_of_its_lines_leaves(monkeypatch, capfd):
+    read, write = os.pipe()
+    os.close(read)
+    done = []
+
+    def work(options, show):
+        for _ in range(3):
+            show.line("a line")
+            done.append(1)
+        return len(done)
+
+    with io.TextIOWrapper(os.fdopen(write, "wb", buffering=-1)) as pipe:
+        monkeypatch.setattr(sys, "stdout", pipe)
+        code = command_line.run(train.Options, work, program="train", arguments=[], status=lambda count: count)
+    assert code == len(done) == 3 and capfd.readouterr().err == ""
 
 
 def test_a_command_as_argument_is_told_how_it_is_called(capsys, monkeypatch):
@@ -243,3 +313,20 @@ def test_a_model_that_predicts_no_sensor_is_neither_drawn_nor_judged(monkeypatch
     monkeypatch.setattr(train.dream, "dream", lambda *_: done.append("drawn"))
     train.train(train.Options(preset="tiny", heads=heads, runs_dir=tmp_path), screen.Screen())
     assert (done[0].preview is not None) is visible and done[1:] == (["judged", "drawn"] if visible else [])
+
+
+def test_progress_reaches_its_end(capsys):
+    show = screen.Screen()
+    with show.counter("packing", "frames") as progress:
+        for done in range(16, 100, 16):
+            progress(done, 100)
+    assert capsys.readouterr().out.splitlines()[-1] == "packing: 100/100 frames"
+    with pytest.raises(OSError), show.counter("packing", "frames") as progress:
+        progress(50, 100)
+        raise OSError
+    assert capsys.readouterr().out.splitlines() == ["packing: 50/100 frames"]
+
+
+def test_one_of_a_kind_is_not_many():
+    assert [words.counted(number, "run") for number in (0, 1, 2)] == ["0 runs", "1 run", "2 runs"]
+    assert [words.counted(number, "entry", "entries") for number in (1, 2)] == ["1 entry", "2 entries"]

@@ -2,11 +2,12 @@
 
 import dataclasses
 import json
+import math
 
 import pytest
 
 from muvo_jax import config as config_lib
-from muvo_jax import presets
+from muvo_jax import limits, presets
 
 
 @pytest.mark.parametrize("name", sorted(presets.PRESETS))
@@ -46,6 +47,45 @@ def test_bad_values_are_refused_with_the_reason(field, value, message):
         "model.latent": "1d", "model.lidar": "pp", "model.camera": "bev"})
     with pytest.raises(ValueError, match=message):
         config_lib.override(town, field, value)
+
+
+SETTINGS = [(section, name, whole, limit) for section in
+            ("model", "loss", "optimizer", "data", "augmentation", "train", "evaluation", "contract")
+            for name, limit, whole in limits.of(type(getattr(config_lib.Config(), section)))]
+
+
+@pytest.mark.parametrize(("section", "name", "whole", "limit"), SETTINGS, ids=[f"{s[0]}.{s[1]}" for s in SETTINGS])
+def test_no_number_of_the_settings_may_be_what_it_cannot_be(section, name, whole, limit):
+    """Every number of every section: NaN, infinity, text, true, and one step beyond each end of its range."""
+    config = presets.get("tiny")
+    now = getattr(getattr(config, section), name)
+    if now == ():
+        now = (1.0,)
+    like = lambda value: (value,) * len(now) if isinstance(now, tuple) else value
+    wrong = [like("much"), like(True)]
+    wrong += [] if whole else [like(math.nan), like(math.inf), like(-math.inf)]
+    if math.isfinite(limit.lowest):
+        wrong.append(like(limit.lowest if limit.open_low else limit.lowest - 1))
+    if math.isfinite(limit.highest):
+        wrong.append(like(limit.highest if limit.open_high else limit.highest * 2 + 1))
+    for value in wrong:
+        with pytest.raises(ValueError, match=f"{section}.*{name}"):
+            config_lib.override(config, f"{section}.{name}", value)
+    if not whole and not isinstance(now, tuple):
+        with pytest.raises(limits.RangeError, match=rf"{name} is nan; it must be "):
+            dataclasses.replace(getattr(config, section), **{name: math.nan})
+
+
+def test_every_weight_rate_and_probability_has_a_range():
+    unlimited = {name for section, name, _, limit in SETTINGS if limit == limits.FINITE}
+    assert unlimited == set()
+
+
+def test_geometry_says_what_is_wrong_in_its_own_words():
+    with pytest.raises(ValueError, match=r"elevation_min_rad is 0.2; it must be below elevation_max_rad, 0.1"):
+        config_lib.RangeViewGeometry(elevation_min_rad=0.2, elevation_max_rad=0.1)
+    with pytest.raises(ValueError, match=r"VoxelGrid.voxel_size_m is 0.0; it must be above 0 and at most 1000 m"):
+        config_lib.VoxelGrid(voxel_size_m=0.0)
 
 
 def test_a_kept_run_that_says_nothing_of_steps_goes_on_taking_the_first_action():

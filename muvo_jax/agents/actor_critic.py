@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from typing import Any
+from typing import Annotated, Any
 
 import flax.struct
 import jax
@@ -19,6 +19,7 @@ import optax
 from flax import linen
 
 from muvo_jax.agents import environment as environment_lib
+from muvo_jax.limits import COUNT, NOT_NEGATIVE, SHARE, above, check
 from muvo_jax.ops import precision
 from muvo_jax.types import Array
 
@@ -33,17 +34,20 @@ class ActorCriticConfig:
       target_rate: of the exponential average that gives bootstrap values.
     """
 
-    starts: int = 64
-    horizon: int = 12
-    width: int = 128
-    layers: int = 2
-    discount: float = 0.98
-    lambda_: float = 0.95
-    entropy: float = 3e-3
-    learning_rate: float = 3e-4
-    clip_norm: float = 100.0
-    target_rate: float = 0.02
-    scale_rate: float = 0.01
+    starts: Annotated[int, COUNT] = 64
+    horizon: Annotated[int, COUNT] = 12
+    width: Annotated[int, COUNT] = 128
+    layers: Annotated[int, COUNT] = 2
+    discount: Annotated[float, SHARE] = 0.98
+    lambda_: Annotated[float, SHARE] = 0.95
+    entropy: Annotated[float, NOT_NEGATIVE] = 3e-3
+    learning_rate: Annotated[float, above(0)] = 3e-4
+    clip_norm: Annotated[float, above(0)] = 100.0
+    target_rate: Annotated[float, SHARE] = 0.02
+    scale_rate: Annotated[float, SHARE] = 0.01
+
+    def __post_init__(self):
+        check(self)
 
 
 @flax.struct.dataclass
@@ -143,13 +147,13 @@ class _Act:
 
     def __call__(self, actor, key, observation):
         mean, std = _moments(self.config, actor, observation)
-        return jnp.tanh(mean + std * jax.random.normal(key, mean.shape) if self.sampled else mean)
+        return jnp.tanh(mean + std * jax.random.normal(key, mean.shape, jnp.float32) if self.sampled else mean)
 
 
 def init(key: Array, environment: environment_lib.Environment, config: ActorCriticConfig) -> Learner:
     """A fresh learner for observations that are one vector."""
     key_actor, key_critic = jax.random.split(key)
-    observation = jnp.zeros((environment.model.policy_feature_channels,))
+    observation = jnp.zeros((environment.model.policy_feature_channels,), jnp.float32)
     actor, critic = _actor(config).init(key_actor, observation), _critic(config).init(key_critic, observation)
     return Learner(actor, critic, critic, jnp.float32(1.0), _optimizer(config).init((actor, critic)), jnp.int32(0))
 
@@ -167,7 +171,7 @@ def imagine(environment, config, params, key, actor):
         observation, state = carry
         key_action, key_step = jax.random.split(key)
         mean, std = _moments(config, actor, observation)
-        drawn = mean + std * jax.random.normal(key_action, mean.shape)
+        drawn = mean + std * jax.random.normal(key_action, mean.shape, jnp.float32)
         keys = jax.random.split(key_step, config.starts)
         state, transition = jax.vmap(environment.step, (0, 0, 0, None))(keys, state, jnp.tanh(drawn), params)
         return (transition.observation, state), (observation, drawn, transition)

@@ -19,6 +19,7 @@ import numpy as np
 from muvo_jax.agents import environment as environment_lib
 from muvo_jax.agents import planners
 from muvo_jax.model import live
+from muvo_jax.model import memory as memory_lib
 from muvo_jax.ops import motion as motion_ops
 from muvo_jax.types import Array, ArrayLike, LatentState, Memory, Variables
 
@@ -176,7 +177,7 @@ def planning_driver(simulator: Simulator, environment: environment_lib.Environme
     def driver(key, memory, state, previous):
         key_filter, key_plan = jax.random.split(key)
         if memory is None:
-            memory = PlanMemory(live.start_live(environment.model, key_filter), jnp.zeros((horizon, 2)),
+            memory = PlanMemory(live.start_live(environment.model, key_filter), jnp.zeros((horizon, 2), jnp.float32),
                                 jnp.float32(0))
         observation = {name: np.asarray(value)[None] for name, value in simulator.observe(state).items()}
         memory = plan_step(environment, planner, config, variables, key_plan, memory, observation, previous[None],
@@ -194,7 +195,9 @@ def plan_step(environment: environment_lib.Environment, planner: str, config: pl
     filtered = live.observe_step(environment.model, variables, memory.live, observation, previous_action,
                                  sampled=False)
     speed_mps, route_map = observation["speed_mps"], observation.get("route_map")
-    bank = environment_lib.StartBank(filtered.latent, speed_mps, route_map, filtered.memory, jnp.zeros((1,), jnp.int32))
+    model_config = environment.model.config
+    remembered = memory_lib.with_evidence(model_config, filtered.memory, filtered.latent.vantage)  # one for all plans
+    bank = environment_lib.StartBank(filtered.latent, speed_mps, route_map, remembered, jnp.zeros((1,), jnp.int32))
     horizon = memory.plan.shape[0]
     params = dataclasses.replace(environment.params(variables, bank, horizon), temperature=temperature)
     state = environment_lib.EnvState(filtered.latent[0], motion_ops.at_rest_of_frame(speed_mps[0]), jnp.int32(0),
@@ -226,7 +229,8 @@ def constant_driver(action: Sequence[float]) -> Driver:
 
 def random_driver() -> Driver:
     """A uniform action in [-1, 1] at every step."""
-    return lambda key, memory, state, previous: (memory, np.asarray(jax.random.uniform(key, (2,), minval=-1.0)))
+    draw = lambda key: np.asarray(jax.random.uniform(key, (2,), jnp.float32, minval=-1.0))
+    return lambda key, memory, state, previous: (memory, draw(key))
 
 
 def summarise(drives: Mapping[str, Sequence[Drive]], expert: str, route_m: float) -> dict[str, dict[str, float]]:

@@ -18,7 +18,7 @@ import jax.numpy as jnp
 
 from muvo_jax import config as config_lib
 from muvo_jax import run as run_lib
-from muvo_jax.agents import rewards
+from muvo_jax.agents import forks, rewards
 from muvo_jax.model import checks
 from muvo_jax.model import memory as memory_lib
 from muvo_jax.model.world_model import WorldModel
@@ -146,8 +146,12 @@ class Environment:
     def of_run(cls, run: run_lib.Run, *, learned_reward: bool = False, **options: Any) -> Environment:
         """The environment of a run: model, contract and stride are its own; options as in Environment.
 
-        `learned_reward` takes reward and ends from the heads reward and continue (rewards.learned_reward).
+        `learned_reward` takes reward and ends from the heads reward and continue (rewards.learned_reward). The driving
+        reward reads the route map at the recording's scale where reward_config does not say another one.
         """
+        reward_config = options.get("reward_config", rewards.RewardConfig())
+        if reward_config.route == config_lib.RouteMap():
+            options["reward_config"] = dataclasses.replace(reward_config, route=run.config.data.route_map)
         if learned_reward:
             options |= {"reward_function": rewards.learned_reward, "reward_heads": rewards.LEARNED_HEADS}
         return cls(run.model, contract=run.contract, periods=run.config.data.stride, **options)
@@ -222,6 +226,8 @@ class Environment:
             raise ValueError(f"StartBank: got states {list(lead)} and speeds {list(bank.speed_mps.shape)}; expected "
                              f"both [M] with M at least 1.")
         checks.counts(horizon, None)
+        checks.finite("StartBank", latent=bank.latent, speed_mps=bank.speed_mps)
+        checks.finite("params", temperature=temperature)
         guessed = memory_lib.guessed_heads(self.model.config)
         if not set(guessed).isdisjoint(self.decoded_heads) and (bank.memory is None or bank.row is None):
             raise ValueError(f"StartBank: it has no memory, but the heads {', '.join(guessed)} of this model look at "
@@ -230,7 +236,8 @@ class Environment:
 
     def reset(self, key: Array, params: EnvParams) -> tuple[Any, EnvState]:
         """Draws a start from the bank: (observation, state)."""
-        start = jax.random.randint(key, (), 0, params.bank.size)
+        forks.check("Environment.reset")
+        start = jax.random.randint(key, (), 0, params.bank.size, jnp.int32)
         state = EnvState(params.bank.latent[start], motion_ops.at_rest_of_frame(params.bank.speed_mps[start]),
                          start, jnp.int32(0), jnp.float32(0), jnp.bool_(False))
         return self.observe(state, params), state
@@ -243,8 +250,10 @@ class Environment:
 
     def step(self, key: Array, state: EnvState, action: Array, params: EnvParams) -> tuple[EnvState, Transition]:
         """One imagined step under action [2], clipped to [-1, 1]; see Transition. No auto-reset: `restart` does it."""
+        forks.check("Environment.step")
         action = self._checked(action)
-        noise = params.temperature * jax.random.normal(key, state.latent.stochastic.shape)
+        checks.forward_mode("Environment.step", self.model, params.variables, state, action)
+        noise = params.temperature * jax.random.normal(key, state.latent.stochastic.shape, jnp.float32)
         batched = jax.tree.map(lambda leaf: jnp.expand_dims(leaf, 0), (noise, state.latent, action))
         latent, _ = self.model.imagine_step(params.variables, *batched)
         latent = latent[0]
@@ -295,13 +304,29 @@ class Environment:
         return jnp.clip(checks.one_action(action, (), "Environment.step"), -1.0, 1.0)
 
 
-@functools.partial(jax.jit, static_argnames=("environment", "horizon"))
 def play(environment: Environment, params: EnvParams, key: Array, state: EnvState, driver: Any,
          horizon: int) -> tuple[EnvState, Transition]:
     """Rolls one episode on: driver is actions [H, 2] or a jax.tree_util.Partial policy(key, observation) -> action.
 
     Returns the states and Transitions [H, ...]; nothing restarts.
+
+    Raises:
+      ValueError: for concrete actions that are not finite, outside [-1, 1] or of another shape, or a state that is not
+        finite.
+      TypeError: for forward-mode derivatives through convolutions that have none (ModelConfig.convolution).
     """
+    forks.check("play")
+    if not callable(driver):
+        if jnp.shape(driver) != (horizon, ACTION_CHANNELS):
+            raise ValueError(f"play: got actions {list(jnp.shape(driver))}, expected [{horizon}, 2].")
+        checks.action_values(driver, "play")
+    checks.finite("play", state=state)
+    checks.forward_mode("play", environment.model, params.variables, state, driver)
+    return _play(environment, params, key, state, driver, horizon)
+
+
+@functools.partial(jax.jit, static_argnames=("environment", "horizon"))
+def _play(environment, params, key, state, driver, horizon):
     def step(state, inputs):
         key, action = inputs
         key_policy, key_step = jax.random.split(key)

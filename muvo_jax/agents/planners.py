@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable
+from typing import Annotated
 
 import flax.struct
 import jax
@@ -15,6 +16,8 @@ import jax.numpy as jnp
 import optax
 
 from muvo_jax.agents import environment as environment_lib
+from muvo_jax.limits import COUNT, NOT_NEGATIVE, SHARE, above, check
+from muvo_jax.model import checks
 from muvo_jax.ops import precision
 from muvo_jax.types import Array
 
@@ -37,21 +40,21 @@ class PlannerConfig:
       learning_rate: of gradient planning (Adam).
     """
 
-    plans: int = 64
-    iterations: int = 4
-    elites: int = 8
-    kept: int = 3
-    noise_exponent: float = 2.0
-    std: float = 0.5
-    smoothing: float = 0.1
-    temperature: float = 0.5
-    learning_rate: float = 0.1
+    plans: Annotated[int, COUNT] = 64
+    iterations: Annotated[int, COUNT] = 4
+    elites: Annotated[int, COUNT] = 8
+    kept: Annotated[int, NOT_NEGATIVE] = 3
+    noise_exponent: Annotated[float, NOT_NEGATIVE] = 2.0
+    std: Annotated[float, above(0)] = 0.5
+    smoothing: Annotated[float, SHARE] = 0.1
+    temperature: Annotated[float, above(0)] = 0.5
+    learning_rate: Annotated[float, above(0)] = 0.1
 
     def __post_init__(self):
-        if not 0 <= self.kept <= self.elites <= self.plans or self.elites < 1 or self.iterations < 1:
-            raise ValueError(f"PlannerConfig: expected 0 <= kept <= elites <= plans, at least one elite and one "
-                             f"iteration; got kept={self.kept}, elites={self.elites}, plans={self.plans}, "
-                             f"iterations={self.iterations}.")
+        check(self)
+        if not self.kept <= self.elites <= self.plans:
+            raise ValueError(f"PlannerConfig: expected kept <= elites <= plans; got kept={self.kept}, "
+                             f"elites={self.elites}, plans={self.plans}.")
 
 
 @flax.struct.dataclass
@@ -67,6 +70,7 @@ def cem(objective: Objective, key: Array, start: Array, config: PlannerConfig = 
 
     Returns the best plan seen.
     """
+    start = _checked(start)
     horizon, channels = start.shape
 
     def iterate(carry, key):
@@ -82,16 +86,19 @@ def cem(objective: Objective, key: Array, start: Array, config: PlannerConfig = 
         return (blend(mean, elites.mean(axis=0)), blend(std, elites.std(axis=0)), elites, elite_values), None
 
     first = (jnp.clip(start, -1.0, 1.0), jnp.full_like(start, config.std),
-             jnp.zeros((config.elites, horizon, channels)), jnp.full((config.elites,), -jnp.inf))
+             jnp.zeros((config.elites, horizon, channels), jnp.float32),
+             jnp.full((config.elites,), -jnp.inf, jnp.float32))
     (_, _, elites, values), _ = jax.lax.scan(iterate, first, jax.random.split(key, config.iterations))
     return Plan(elites[0], values[0])
 
 
 def mppi(objective: Objective, key: Array, start: Array, config: PlannerConfig = PlannerConfig()) -> Plan:
     """Model-predictive path integral control: the mean of all plans, weighted by exp(return / temperature)."""
+    start = _checked(start)
+
     def iterate(mean, key):
         key_noise, key_value = jax.random.split(key)
-        noise = config.std * jax.random.normal(key_noise, (config.plans, *start.shape))
+        noise = config.std * jax.random.normal(key_noise, (config.plans, *start.shape), jnp.float32)
         plans = jnp.clip(mean[None] + noise, -1.0, 1.0).at[0].set(mean)
         values = _finite(objective(key_value, plans))
         weights = jax.nn.softmax(values / config.temperature)
@@ -103,6 +110,7 @@ def mppi(objective: Objective, key: Array, start: Array, config: PlannerConfig =
 
 def gradient(objective: Objective, key: Array, start: Array, config: PlannerConfig = PlannerConfig()) -> Plan:
     """Gradient ascent on the return through the world model, projected to [-1, 1]; returns the best plan seen."""
+    start = _checked(start)
     optimizer = optax.adam(config.learning_rate)
     value_and_gradient = jax.value_and_grad(lambda plan, key: objective(key, plan[None])[0])
 
@@ -122,6 +130,18 @@ def gradient(objective: Objective, key: Array, start: Array, config: PlannerConf
     return Plan(jnp.where(better, plan, best.actions), jnp.where(better, value, best.value))
 
 
+def _checked(start: Array) -> Array:
+    """The plan to start from, float32 [H, 2].
+
+    Raises:
+      ValueError: for another shape, or where it is concrete and not finite.
+    """
+    if jnp.ndim(start) != 2 or jnp.shape(start)[1] != environment_lib.ACTION_CHANNELS or not jnp.shape(start)[0]:
+        raise ValueError(f"planner: got a start {list(jnp.shape(start))}, expected [H, 2].")
+    checks.finite("planner", start=start)
+    return jnp.asarray(start, jnp.float32)
+
+
 PLANNERS = {"cem": cem, "mppi": mppi, "gradient": gradient}
 
 
@@ -138,8 +158,8 @@ def imagined_returns(environment: environment_lib.Environment, params: environme
         def one(key, plan):
             _, transitions = environment_lib.play(environment, params, key, state, plan, horizon)
             alive = 1.0 - transitions.terminated.astype(jnp.float32)
-            before = jnp.concatenate([jnp.ones(1), jnp.cumprod(alive)[:-1]])
-            return (discount ** jnp.arange(horizon) * before * transitions.reward).sum()
+            before = jnp.concatenate([jnp.ones(1, jnp.float32), jnp.cumprod(alive)[:-1]])
+            return (discount ** jnp.arange(horizon, dtype=jnp.float32) * before * transitions.reward).sum()
 
         keys = jax.random.split(key, noises)
         return jax.vmap(lambda plan: jax.vmap(one, (0, None))(keys, plan).mean())(plans)
@@ -154,13 +174,14 @@ def shift(plan: Array) -> Array:
 
 def coloured_noise(key: Array, shape: tuple[int, int, int], exponent: float) -> Array:
     """Unit-variance noise [P, H, A] whose power falls with frequency over H as 1 / f**exponent; 0 gives white noise."""
-    white = jax.random.normal(key, shape)
+    white = jax.random.normal(key, shape, jnp.float32)
     if not exponent or shape[1] < 2:
         return white
-    frequencies = jnp.fft.rfftfreq(shape[1])
+    frequencies = jnp.fft.rfftfreq(shape[1]).astype(jnp.float32)
     scale = jnp.maximum(frequencies, frequencies[1]) ** (-exponent / 2)
     coloured = jnp.fft.irfft(jnp.fft.rfft(white, axis=1) * scale[None, :, None], n=shape[1], axis=1)
-    weights = jnp.where((jnp.arange(scale.shape[0]) == 0) | (2 * jnp.arange(scale.shape[0]) == shape[1]), 1.0, 2.0)
+    weights = jnp.where((jnp.arange(scale.shape[0]) == 0) | (2 * jnp.arange(scale.shape[0]) == shape[1]),
+                        jnp.float32(1.0), jnp.float32(2.0))
     return coloured / jnp.sqrt((weights * scale**2).sum() / shape[1])
 
 

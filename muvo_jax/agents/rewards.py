@@ -9,6 +9,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Mapping
+from typing import Annotated
 
 import flax.struct
 import jax
@@ -16,6 +17,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from muvo_jax import config as config_lib
+from muvo_jax import limits
+from muvo_jax.config import RouteMap
+from muvo_jax.limits import COUNT, NOT_NEGATIVE, above
 from muvo_jax.ops import motion as motion_ops
 from muvo_jax.types import Array, Motion
 
@@ -30,14 +34,8 @@ class EgoBox:
     low_m: float = 0.6
     high_m: float = 1.6
 
-
-@dataclasses.dataclass(frozen=True)
-class RouteMap:
-    """Geometry of Batch.route_map: the car is in row `ego_row`, column `ego_column`, looking towards row 0."""
-
-    metres_per_px: float = 0.75
-    ego_row: float = 48.0
-    ego_column: float = 32.0
+    def __post_init__(self):
+        limits.check(self)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -54,19 +52,24 @@ class RewardConfig:
       speed_limit_mps: what counts as fast.
       comfortable_mps2: acceleration, along and across, that costs 1.
       occupancy_scale: decode occupancy at 1, 1/2 or 1/4 of its resolution; coarser is cheaper.
+      box: the car.
+      route: scale of the route map; where it is left at the town's, `Environment.of_run` takes the recording's.
     """
 
-    progress: float = 1.0
-    collision: float = 5.0
-    comfort: float = 0.05
-    speeding: float = 2.0
-    terminal_collision: float = 0.5
-    route_tolerance_m: float = 2.0
-    speed_limit_mps: float = 10.0
-    comfortable_mps2: float = 3.0
-    occupancy_scale: int = 1
+    progress: Annotated[float, NOT_NEGATIVE] = 1.0
+    collision: Annotated[float, NOT_NEGATIVE] = 5.0
+    comfort: Annotated[float, NOT_NEGATIVE] = 0.05
+    speeding: Annotated[float, NOT_NEGATIVE] = 2.0
+    terminal_collision: Annotated[float, NOT_NEGATIVE] = 0.5
+    route_tolerance_m: Annotated[float, above(0, unit="m")] = 2.0
+    speed_limit_mps: Annotated[float, above(0, unit="m/s")] = 10.0
+    comfortable_mps2: Annotated[float, above(0, unit="m/s2")] = 3.0
+    occupancy_scale: Annotated[int, COUNT] = 1
     box: EgoBox = EgoBox()
     route: RouteMap = RouteMap()
+
+    def __post_init__(self):
+        limits.check(self)
 
 
 @flax.struct.dataclass

@@ -14,7 +14,7 @@ Facts from the authors' repository (github.com/fzi-forschungszentrum-informatik/
 from __future__ import annotations
 
 import pathlib
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -95,10 +95,16 @@ def read_birdview(path: pathlib.Path) -> np.ndarray:
     return pixels.astype(np.uint16)  # Pillow says int32 or uint16, depending on its version
 
 
-def read_labels(paths: Mapping[str, pathlib.Path], grid: config_lib.VoxelGrid) -> schema.RawFrame:
+def read_labels(paths: Mapping[str, pathlib.Path], grid: config_lib.VoxelGrid,
+                translate: Callable[[np.ndarray, pathlib.Path], np.ndarray] | None = None) -> schema.RawFrame:
     """The labels whose files are given: depth_m, image_classes, image_instance_mask and those of the bird's eye.
 
     The bird's-eye picture is looked up at the middle of each cell of the grid's ground plan: class 255 outside of it.
+
+    Args:
+      paths: of the files, by label.
+      grid: its ground plan.
+      translate: (tags, file) -> the layout's tags; by default they are the layout's.
 
     Raises:
       DataError: where a file is missing or damaged.
@@ -108,7 +114,7 @@ def read_labels(paths: Mapping[str, pathlib.Path], grid: config_lib.VoxelGrid) -
     if camera:  # one file
         share, tags = read_depth_semantic(camera[0])
         frame["depth_m"] = np.where(share < 1.0, share * DEPTH_RANGE_M, np.inf).astype(np.float32)
-        frame["image_classes"] = known_classes(tags)
+        frame["image_classes"] = known_classes(translate(tags, camera[0]) if translate else tags)
         frame["image_instance_mask"] = schema.instance_mask(frame["image_classes"], CLASSES)
     if "birds_eye_classes" in paths:
         bits = read_birdview(paths["birds_eye_classes"]).astype(np.uint32)
@@ -131,12 +137,12 @@ def known_classes(tags: np.ndarray) -> np.ndarray:
     return np.where(tags < len(CLASSES), tags, UNKNOWN_TAG).astype(np.uint8)
 
 
-def point_classes(scan: Points, path: pathlib.Path) -> np.ndarray:
-    """uint8 [N], what each point hit; raises DataError where the recording does not say."""
+def point_tags(scan: Points, path: pathlib.Path) -> np.ndarray:
+    """uint8 [N], the tag of each point; raises DataError where the recording does not say."""
     if scan.tags is None:
         raise schema.DataError(f"{path}: its points have no tags (ObjTag), which the head semantic_range_view learns "
                                f"from. Leave the head out, or record a semantic lidar.")
-    return known_classes(scan.tags)
+    return scan.tags
 
 
 def read_route_map(path: pathlib.Path) -> np.ndarray:
@@ -185,8 +191,12 @@ def in_ego_box(points_m: np.ndarray) -> np.ndarray:
     return (np.abs(x) < half_length) & (np.abs(y) < half_width) & (z > 0) & (z < height)
 
 
-def read_voxels(path: pathlib.Path, grid: config_lib.VoxelGrid) -> np.ndarray:
+def read_voxels(path: pathlib.Path, grid: config_lib.VoxelGrid,
+                translate: Callable[[np.ndarray, pathlib.Path], np.ndarray] | None = None) -> np.ndarray:
     """Returns occupancy, uint8 [X, Y, Z]: 1 where a voxel holds something that is_occupied, else 0.
+
+    Args:
+      translate: as of `read_labels`.
 
     Raises:
       Refused: where the file is pickled and asks for more than arrays.
@@ -200,7 +210,7 @@ def read_voxels(path: pathlib.Path, grid: config_lib.VoxelGrid) -> np.ndarray:
         raise schema.DataError(f"{path}: voxel {index[~((index >= 0) & (index < np.asarray(grid.shape))).all(1)][0]} "
                                f"lies outside a grid of {list(grid.shape)}. Describe the grid in sensors.toml.")
     occupancy = np.zeros(grid.shape, np.uint8)
-    occupancy[tuple(index.T)] = is_occupied(rows[:, 3])
+    occupancy[tuple(index.T)] = is_occupied(translate(rows[:, 3], path) if translate else rows[:, 3])
     return occupancy
 
 

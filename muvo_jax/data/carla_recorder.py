@@ -15,7 +15,7 @@ from typing import Protocol
 
 import numpy as np
 
-from muvo_jax.data import carla, carla_frames, processes, recorder, schema
+from muvo_jax.data import carla, carla_files, carla_frames, processes, recorder, schema
 from muvo_jax.data.carla_drives import SPLITS, BadDriveError, CarlaDrive, CarlaError, Settings, estimate
 from muvo_jax.data.carla_frames import SENSORS, Tick
 
@@ -171,4 +171,5 @@ def _describe(out: pathlib.Path, settings: Settings) -> None:
     camera = schema.Camera.level(settings.width_px, settings.height_px, settings.fov_rad, settings.position_m)
     recorder.write_description(out, name="CARLA", rate_hz=settings.rate_hz, camera=camera, lidar=settings.lidar,
                                voxels=carla.VOXELS, splits=SPLITS,
-                               contract=dataclasses.replace(carla.CONTRACT, rate_hz=settings.rate_hz))
+                               contract=dataclasses.replace(carla.CONTRACT, rate_hz=settings.rate_hz),
+                               classes=carla_files.CLASSES, route_map=carla.ROUTE_MAP)

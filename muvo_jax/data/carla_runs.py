@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
+import os
 import pathlib
+import re
 import warnings
 from collections.abc import Sequence
 
@@ -13,6 +15,8 @@ from muvo_jax.data import files, safe_pickle, schema
 
 FRAME_FILE = "pd_dataframe.pkl"
 VERSION_FOLDER = "trainval"
+_NUMBER = re.compile(r"(\d{1,18})$")
+_PICTURES = (".png", ".jpg", ".jpeg")
 _MODES = ("train", "val0", "val1", "val2")
 
 
@@ -67,11 +71,91 @@ class Run:
           DataError: where the row names no file below the run's folder.
         """
         relative = self.columns[f"{kind}_path"][row]
-        parts = pathlib.PurePosixPath(relative).parts if isinstance(relative, str) else ()
+        # Tables that were written on Windows have its separators.
+        parts = pathlib.PurePosixPath(relative.replace("\\", "/")).parts if isinstance(relative, str) else ()
         if not parts or ".." in parts or parts[0] == "/" or "\0" in relative:
             raise schema.DataError(f"{self.folder / FRAME_FILE}, row {row}: {kind}_path is {str(relative)[:80]!r}, "
                                    f"expected a path inside the run's folder.")
         return self.folder.joinpath(*parts)
+
+
+@dataclasses.dataclass(frozen=True)
+class KindFiles:
+    """The files of one kind of a run.
+
+    Attributes:
+      present: bool [F], which rows have one.
+      unusual: row -> the file, where it is not the one that the table names: another suffix or other case.
+    """
+
+    present: np.ndarray
+    unusual: dict[int, pathlib.Path]
+
+
+def find_files(run: Run, kind: str) -> KindFiles:
+    """Which files of a kind there are, whatever the case of their suffixes; images may have become JPEG.
+
+    Raises:
+      DataError: where files are there, but none that the table names.
+    """
+    present = np.zeros(run.frames, bool)
+    unusual: dict[int, pathlib.Path] = {}
+    if f"{kind}_path" not in run.columns:
+        return KindFiles(present, unusual)
+    paths = [run.path(kind, row) for row in range(run.frames)]
+    listed = {folder: _by_stem(folder) for folder in {path.parent for path in paths}}
+    for row, path in enumerate(paths):
+        names = listed[path.parent].get(path.stem, {})
+        suffixes = (path.suffix, *_PICTURES) if path.suffix.lower() in _PICTURES and kind == "image" else (path.suffix,)
+        found = next((names[suffix.lower()] for suffix in suffixes if suffix.lower() in names), None)
+        present[row] = found is not None
+        if found is not None and found != path.name:
+            unusual[row] = path.with_name(found)
+    if paths and not present.any() and any(listed.values()):
+        folder = paths[0].parent
+        raise schema.DataError(f"{folder}: holds {files.listing(folder)}, but {FRAME_FILE} names {paths[0].name} and "
+                               f"its like. Rename the files as the table names them, or take the folder away.")
+    return KindFiles(present, unusual)
+
+
+def _by_stem(folder: pathlib.Path) -> dict[str, dict[str, str]]:
+    """stem -> suffix in lower case -> name, of the files of a folder; empty where there is none."""
+    found: dict[str, dict[str, str]] = {}
+    if folder.is_dir():
+        for name in sorted(os.listdir(folder)):
+            if not name.startswith("."):
+                stem, suffix = os.path.splitext(name)
+                found.setdefault(stem, {}).setdefault(suffix.lower(), name)
+    return found
+
+
+def numbering(run: Run) -> np.ndarray:
+    """The number of each frame, int64 [F], by the name of its first file; the row where names have no number.
+
+    Raises:
+      DataError: where they do not increase: rows were sorted otherwise than they were recorded.
+    """
+    columns = [column.removesuffix("_path") for column in run.columns if column.endswith("_path")]
+    for kind in columns:
+        found = [_NUMBER.search(run.path(kind, row).stem) for row in range(run.frames)]
+        if all(found):
+            numbers = np.array([int(match[1]) for match in found if match], np.int64)
+            wrong = np.flatnonzero(np.diff(numbers) <= 0)
+            if wrong.size:
+                row = int(wrong[0]) + 1
+                raise schema.DataError(f"{run.folder / FRAME_FILE}, row {row}: frame {numbers[row]} comes after frame "
+                                       f"{numbers[row - 1]}; rows must be in the order of their recording. Sort the "
+                                       f"table.")
+            return numbers
+    return np.arange(run.frames)
+
+
+def root_levels(path: pathlib.Path) -> int:
+    """How many folders above `path` (a root, version, mode, town or run folder) the recording's root may be."""
+    depth = next((depth for depth in range(5) if any(path.glob("/".join(["*"] * depth + [FRAME_FILE])))), 4)
+    above = [path.resolve(), *path.resolve().parents][:5 - depth]
+    version = next((level for level, folder in enumerate(above) if folder.name == VERSION_FOLDER), None)
+    return max(3 - depth, 0) if version is None else version + 1
 
 
 def folders(path: pathlib.Path) -> list[tuple[str, pathlib.Path]]:

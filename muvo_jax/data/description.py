@@ -1,17 +1,20 @@
-"""Sensor descriptions in TOML: sections [camera], [lidar], [voxels], [action], each a dataclass, with clear errors."""
+"""Descriptions in TOML: sections [camera], [lidar], [voxels], [action], [route_map], each a dataclass; clear errors."""
 
 from __future__ import annotations
 
 import dataclasses
+import difflib
 import pathlib
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from typing import Any
 
 from muvo_jax import config as config_lib
 from muvo_jax.data import schema
 
 _SECTIONS: dict[str, Callable] = {"camera": schema.Camera, "lidar": config_lib.RangeViewGeometry,
-                                  "voxels": config_lib.VoxelGrid, "action": config_lib.ActionContract}
+                                  "voxels": config_lib.VoxelGrid, "action": config_lib.ActionContract,
+                                  "route_map": config_lib.RouteMap}
+_SAME_RATE = 0.01
 
 
 def tables(**sections) -> dict[str, dict[str, Any]]:
@@ -40,19 +43,48 @@ def rate_hz(header: dict, path: pathlib.Path) -> float:
     """Frames per second.
 
     Raises:
-      DataError: where it is missing or not above 0.
+      DataError: where it is missing or cannot be.
     """
     value = float(field(header, "rate_hz", (int, float), path))
-    if not 0 < value < float("inf"):
-        raise schema.DataError(f"{path}: rate_hz is {value}, expected a number above 0.")
+    if not config_lib.RATE_HZ.holds(value):
+        raise schema.DataError(f"{path}: rate_hz is {value}; it must be {config_lib.RATE_HZ}.")
     return value
+
+
+def names(header: dict, name: str, path: pathlib.Path) -> tuple[str, ...]:
+    """A top-level list of different names.
+
+    Raises:
+      DataError: where it is missing, empty, or holds something else or one name twice.
+    """
+    found = field(header, name, list, path)
+    if not found or not all(isinstance(item, str) and item for item in found) or len(set(found)) < len(found):
+        raise schema.DataError(f"{path}: {name} is {found!r}, expected a list of different names.")
+    return tuple(found)
+
+
+def contract(header: dict, path: pathlib.Path, rate_hz: float) -> config_lib.ActionContract | None:
+    """The section [action]; its rate_hz may be left out. None where there is no such section.
+
+    Raises:
+      DataError: as `section`, or where its rate is another one than that of the frames.
+    """
+    given = header.get("action")
+    if isinstance(given, dict) and "rate_hz" not in given:
+        header = header | {"action": given | {"rate_hz": rate_hz}}
+    found = section(header, "action", path, required=False)
+    if found is not None and abs(found.rate_hz / rate_hz - 1.0) > _SAME_RATE:
+        raise schema.DataError(f"{path}: rate_hz is {rate_hz:g}, but action.rate_hz is {found.rate_hz:g}: a step would "
+                               f"last two times. An action belongs to each frame; leave action.rate_hz out, or make "
+                               f"both the frames' rate.")
+    return found
 
 
 def section(header: dict, name: str, path: pathlib.Path, *, required: bool):
     """One section as its dataclass; None where it is neither there nor required.
 
     Raises:
-      DataError: where it is required and missing, or has unknown fields, wrong types or matrices of another size.
+      DataError: where it is required and missing, or has unknown fields, wrong types or numbers that cannot be.
     """
     if name not in header:
         if required:
@@ -62,15 +94,17 @@ def section(header: dict, name: str, path: pathlib.Path, *, required: bool):
         raise schema.DataError(f"{path}: action.step_action says how windows are cut, not how actions were recorded. "
                                f"Take it out, and train with --set contract.step_action={header[name]['step_action']}.")
     try:
-        value = config_lib.parse(_SECTIONS[name], header[name], f"{path}: {name}")
-    except (TypeError, ValueError) as error:
+        return config_lib.parse(_SECTIONS[name], header[name], f"{path}: {name}")
+    except TypeError as error:
+        raise schema.DataError(f"{path}: {name}: {error}") from error
+    except ValueError as error:
         raise schema.DataError(str(error)) from error
-    if name == "camera":
-        _check_matrix(value.intrinsics, 3, f"{path}: camera.intrinsics")
-        _check_matrix(value.camera_to_ego, 4, f"{path}: camera.camera_to_ego")
-    return value
 
 
-def _check_matrix(rows: tuple[tuple[float, ...], ...], size: int, where: str) -> None:
-    if [len(row) for row in rows] != [size] * size:
-        raise schema.DataError(f"{where}: got {rows}, expected {size} rows of {size} numbers.")
+def check_names(header: dict, path: pathlib.Path, known: Collection[str]) -> None:
+    """Raises DataError for a top-level entry that looks like a misspelt one of `known` or of the sections."""
+    names = (*known, *_SECTIONS)
+    for name in header:
+        near = difflib.get_close_matches(name, names, n=1, cutoff=0.7)
+        if name not in names and near:
+            raise schema.DataError(f"{path}: {name!r} is unknown. Did you mean {near[0]}?")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import pathlib
 import struct
 import tokenize
@@ -9,14 +10,16 @@ import tomllib
 import warnings
 import zipfile
 import zlib
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 
 import numpy as np
-from PIL import Image
+from PIL import Image, ImageOps
 
-from muvo_jax.data import schema
+from muvo_jax.data import schema, words
 
 BAD_POINT_SHARE = 0.01  # more non-finite points than this are a broken file, not noise
+FEW_SHARE = 0.05  # gaps at no more frames than these (or at one) are what recordings have; more are a fault
+_NOT_FRAMES = ("Thumbs.db", "desktop.ini")
 GAP_PERIODS = 1.5  # a time step longer than this many periods is a gap
 # Pillow raises any of these for broken chunks and for sizes that would fill the memory.
 _IMAGE_ERRORS = (OSError, SyntaxError, ValueError, TypeError, IndexError, OverflowError, MemoryError, zlib.error,
@@ -28,19 +31,55 @@ _ARCHIVE_ERRORS = (OSError, ValueError, EOFError, zipfile.BadZipFile, zlib.error
 
 
 def read_image(path: pathlib.Path, mode: str | None) -> np.ndarray:
-    """Returns a PNG or JPEG: [H, W, 3] for mode "RGB", [H, W, 4] for "RGBA", [H, W] for "L"; for None as it is stored.
+    """Returns a PNG or JPEG in one of these ways:
+
+      "RGB": uint8 [H, W, 3], "RGBA": uint8 [H, W, 4], turned as the camera says it was held (EXIF);
+      "L": uint8 [H, W], of a grey image;
+      "classes": [H, W], the whole number that is stored for each pixel, of a grey image or one with a palette;
+      "depth": uint16 [H, W], of a grey image of 16 bits;
+      None: as it is stored.
 
     Raises:
-      DataError: where the file is missing, truncated or no image.
+      DataError: where the file is missing, truncated, no image, or of other pixels than the mode asks for.
     """
     try:
         with Image.open(path) as image:
-            return np.asarray(image.convert(mode) if mode else image)
+            return _pixels(image, mode, path)
     except FileNotFoundError as error:
         raise missing(path, "an image") from error
+    except schema.DataError:
+        raise
     except _IMAGE_ERRORS as error:
         raise schema.DataError(f"{path}: not a readable image ({error}). The file is truncated or damaged: copy it "
                                f"again, or delete it so that the sequence is split there.") from error
+
+
+def _pixels(image: Image.Image, mode: str | None, path: pathlib.Path) -> np.ndarray:
+    if mode is None:
+        return np.asarray(image)
+    is_wide = image.mode.startswith(("I", "F"))  # more than 8 bits
+    if mode == "depth":
+        pixels = np.asarray(image)
+        if not image.mode.startswith("I") or (pixels.size and not 0 <= pixels.min() <= pixels.max() < 2**16):
+            raise _other_pixels(path, image, "16 bits of grey, the depth in centimetres")
+        return pixels.astype(np.uint16, copy=False)
+    if mode == "classes" and image.mode in ("L", "P", "1"):
+        return np.asarray(image).astype(np.uint8, copy=False)
+    if is_wide:
+        raise _other_pixels(path, image, "8 bits of each colour")
+    if mode in ("RGB", "RGBA"):
+        return np.asarray(ImageOps.exif_transpose(image).convert(mode))
+    if image.mode in ("L", "1", "LA"):
+        return np.asarray(image.convert("L"))
+    pixels = np.asarray(image.convert("RGB"))
+    if (pixels[..., 0] != pixels[..., 1]).any() or (pixels[..., 0] != pixels[..., 2]).any():
+        raise _other_pixels(path, image, "grey" if mode == "L" else "grey, the number of a class in each pixel")
+    return np.ascontiguousarray(pixels[..., 0])
+
+
+def _other_pixels(path: pathlib.Path, image: Image.Image, expected: str) -> schema.DataError:
+    return schema.DataError(f"{path}: an image of {image.width}x{image.height} pixels of Pillow's mode {image.mode!r}, "
+                            f"expected {expected}. Write it that way.")
 
 
 def read_npz(path: pathlib.Path, name: str) -> np.ndarray:
@@ -75,7 +114,7 @@ def npz_holds(path: pathlib.Path, name: str) -> bool:
 def read_toml(path: pathlib.Path) -> dict:
     """Returns a parsed TOML file; raises DataError where it is missing or malformed."""
     try:
-        return tomllib.loads(path.read_text(encoding="utf-8"))
+        return tomllib.loads(path.read_text(encoding="utf-8-sig"))  # editors may write a byte order mark
     except FileNotFoundError as error:
         raise missing(path, "a TOML description") from error
     except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
@@ -117,11 +156,38 @@ def finite_points(points_m: np.ndarray, path: pathlib.Path) -> np.ndarray:
     return points_m[finite]
 
 
-def numbered(folder: pathlib.Path, suffix: str) -> set[int]:
-    """The frame numbers for which `folder` has a file like 000012.png; empty where there is no folder."""
+def numbered(folder: pathlib.Path, suffixes: str | Sequence[str]) -> dict[int, str]:
+    """The files of frames in a folder, frame number -> name: 12.png, 000012.png and 000012.PNG are all frame 12.
+
+    Empty where there is no folder, or nothing in it. Of two suffixes of one name the first of `suffixes` counts.
+
+    Raises:
+      DataError: where two files are of one frame, or files are there but none is named by a number.
+    """
     if not folder.is_dir():
-        return set()
-    return {int(path.stem) for path in folder.iterdir() if path.suffix == suffix and path.stem.isdigit()}
+        return {}
+    order = {suffix: place for place, suffix in enumerate([suffixes] if isinstance(suffixes, str) else suffixes)}
+    found: dict[int, str] = {}
+    others: list[str] = []
+    for name in sorted(os.listdir(folder)):
+        stem, suffix = os.path.splitext(name)
+        if name.startswith(".") or name in _NOT_FRAMES:
+            continue
+        if suffix.lower() not in order or not (stem.isascii() and stem.isdigit()):
+            others.append(name)
+            continue
+        other = found.setdefault(int(stem), name)
+        if other != name:
+            other_stem, other_suffix = os.path.splitext(other)
+            if other_stem != stem or other_suffix.lower() == suffix.lower():
+                raise schema.DataError(f"{folder}: {other} and {name} are both frame {int(stem)}. Remove one of them.")
+            if order[suffix.lower()] < order[other_suffix.lower()]:
+                found[int(stem)] = name
+    if others and not found:
+        raise schema.DataError(f"{folder}: no file is named by the number of its frame, such as "
+                               f"000012{next(iter(order))} ({', '.join(order)}); found {', '.join(others[:3])}. Rename "
+                               f"them, or take the folder away.")
+    return found
 
 
 def check_increasing(timestamps_s: np.ndarray, where: Iterable[str]) -> None:
@@ -162,6 +228,10 @@ def gap_free(present: np.ndarray, breaks: np.ndarray) -> list[tuple[int, int]]:
     return pieces
 
 
+class GapWarning(schema.DataWarning):
+    """A few frames that a sensor lacks, or jumps in time: sequences are cut there, and the rest is whole."""
+
+
 def warn_of_gaps(where: str, present: np.ndarray, absent: dict[str, int], late: np.ndarray, pieces: int) -> None:
     """Warns, with counts, of frames that a sensor lacks and of gaps in time; says nothing where there are none.
 
@@ -180,5 +250,7 @@ def warn_of_gaps(where: str, present: np.ndarray, absent: dict[str, int], late: 
     if late.any():
         found.append(f"time jumps by more than {GAP_PERIODS} periods at {int(late.sum())} of {len(present)} frames")
     if found:
-        warnings.warn(f"{where}: {' and '.join(found)}; what is left makes {pieces} gap-free sequences.",
-                      schema.DataWarning, stacklevel=4)
+        few = max(int((~present).sum()), int(late.sum())) <= max(1, FEW_SHARE * len(present))
+        left = words.counted(pieces, "gap-free sequence")
+        warnings.warn(f"{where}: {' and '.join(found)}; what is left makes {left}.",
+                      GapWarning if few else schema.DataWarning, stacklevel=4)

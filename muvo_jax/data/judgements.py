@@ -11,12 +11,16 @@ import numpy as np
 from muvo_jax import config as config_lib
 from muvo_jax.data import alignment as alignment_lib
 from muvo_jax.data import schema
-from muvo_jax.ops import voxels
 
 # A window of the paper: 12 frames, every second recorded one.
 _WINDOW_FRAMES = 23
-_MOVING_MPS, _TURNING_RADPS = 1.0, 0.02
+MOVING_MPS = 1.0
+_TURNING_RADPS = 0.02
 _FEWEST_SAMPLES = 30
+_MISALIGNED_RAD = math.radians(1.0)  # less is no problem, nor is what the lidar's beams cannot tell
+_UNIT_FACTOR = 1.8  # a speed this many times too large or too small is of another unit
+_SPEED_UNITS = {"km/h": 3.6, "mph": 2.237, "km/s": 0.001, "cm/s": 100.0}
+_HEADING_M = 0.3  # a step so long has a direction
 _OPPOSED, _TOGETHER = -0.5, 0.5  # correlations
 
 
@@ -36,6 +40,7 @@ class DrivingLog:
       action: float64 [F, 2].
       speed_mps, yaw_rate_radps: float64 [F], NaN where not recorded.
       timestamp_s: float64 [F].
+      pose: float64 [F, 3], x, y (m) and yaw (rad), NaN where a frame has none; None where no frame has.
     """
 
     stretch: np.ndarray
@@ -43,6 +48,7 @@ class DrivingLog:
     speed_mps: np.ndarray
     yaw_rate_radps: np.ndarray
     timestamp_s: np.ndarray
+    pose: np.ndarray | None = None
 
     @property
     def acceleration_mps2(self) -> np.ndarray:
@@ -85,7 +91,7 @@ def of_actions(motion: DrivingLog, contract: config_lib.ActionContract) -> list[
     if np.isfinite(motion.speed_mps).any() and np.nanmin(motion.speed_mps) < -0.5:
         found.append(Finding("remark", f"the car drives backwards, at up to {-np.nanmin(motion.speed_mps):.1f} m/s."))
     sound = np.isfinite(action).all(axis=1)
-    turning = sound & (motion.speed_mps > _MOVING_MPS) & np.isfinite(motion.yaw_rate_radps)
+    turning = sound & (motion.speed_mps > MOVING_MPS) & np.isfinite(motion.yaw_rate_radps)
     if contract.source == "recorded":
         steer, turn = action[turning, 1], -motion.yaw_rate_radps[turning]
         found += _agreement("steering", "yaw rate to the right", steer, turn, 1e-3, _TURNING_RADPS)
@@ -139,71 +145,34 @@ def of_time(motion: DrivingLog, rate_hz: float) -> list[Finding]:
         jitter_s > 0.2 * median_s) else []
 
 
-class Figures:
-    """Counts over all frames that were read."""
-
-    def __init__(self, described: schema.RecordingDescription):
-        self._described = described
-        self._points: list[int] = []
-        self._outside: list[float] = []
-        self._road_m: list[float] = []
-        self._in_voxels: list[float] = []
-        self._images = self._dark = self._frozen = 0
-        self._previous: np.ndarray | None = None
-
-    def add(self, frame: schema.RawFrame) -> None:
-        if "image" in frame:
-            image = frame["image"]
-            self._images += 1
-            self._dark += int(image.max() - image.min() < 8)
-            self._frozen += int(self._previous is not None and np.array_equal(image, self._previous)
-                                and frame.get("speed_mps", 1.0) > _MOVING_MPS)
-            self._previous = image
-        if "points_m" not in frame or self._described.lidar is None:
-            return
-        points_m, lidar = frame["points_m"], self._described.lidar
-        self._points.append(len(points_m))
-        if not len(points_m):
-            return
-        relative_m = points_m - np.asarray(lidar.position_m, np.float32)[None]
-        elevation_rad = np.arctan2(relative_m[:, 2], np.hypot(relative_m[:, 0], relative_m[:, 1]))
-        margin_rad = (lidar.elevation_max_rad - lidar.elevation_min_rad) / lidar.rows
-        self._outside.append(float(((elevation_rad < lidar.elevation_min_rad - margin_rad) |
-                                    (elevation_rad > lidar.elevation_max_rad + margin_rad)).mean()))
-        near = (np.abs(points_m[:, 1]) < 2.0) & (np.abs(points_m[:, 0]) < 12.0)
-        if near.sum() > 20:
-            self._road_m.append(float(np.median(points_m[near, 2])))
-        if "occupancy" in frame and self._described.voxels is not None:
-            self._in_voxels.append(_share_in_voxels(points_m, frame["occupancy"], self._described.voxels))
-
-    def findings(self) -> list[Finding]:
-        found = []
-        if self._dark:
-            found.append(Finding("problem", f"{self._dark} of {self._images} images are of one colour."))
-        if self._frozen:
-            found.append(Finding("problem", f"{self._frozen} of {self._images} images are copies of the one before, "
-                                            f"although the car moves."))
-        empty = self._points.count(0)
-        if empty:
-            found.append(Finding("problem", f"{empty} of {len(self._points)} scans are empty."))
-        if self._points:
-            found.append(Finding("remark", f"a scan has {int(np.median(self._points))} points "
-                                           f"({min(self._points)} to {max(self._points)})."))
-        if self._outside and np.mean(self._outside) > 0.05:
-            found.append(Finding("problem", f"{np.mean(self._outside):.0%} of the points lie above or below the "
-                                            f"lidar's described field of view; correct its elevation and position."))
-        if self._road_m and abs(np.median(self._road_m)) > 0.5:
-            found.append(Finding("problem", f"the road under the car is at z = {np.median(self._road_m):.2f} m, "
-                                            f"expected about 0; correct the height of the points or of the lidar."))
-        if self._in_voxels and np.mean(self._in_voxels) < 0.8:
-            found.append(Finding("problem", f"only {np.mean(self._in_voxels):.0%} of the points lie in occupied "
-                                            f"voxels; the grid is described wrongly, or they are of other frames."))
-        return found
-
-
-def _share_in_voxels(points_m: np.ndarray, occupancy: np.ndarray, grid: config_lib.VoxelGrid) -> float:
-    index, inside = voxels.voxel_index(points_m, grid)
-    return float((occupancy[tuple(index[inside].T)] == 1).mean()) if inside.any() else 0.0
+def of_units(motion: DrivingLog) -> list[Finding]:
+    """Whether speed and yaw are of the units that the pose's change over time says."""
+    if motion.pose is None or len(motion.pose) < 2:
+        return []
+    found = []
+    steps_s = np.diff(motion.timestamp_s)
+    usable = (np.diff(motion.stretch) == 0) & (steps_s > 0) & np.isfinite(motion.pose[1:]).all(axis=1) & np.isfinite(
+        motion.pose[:-1]).all(axis=1)
+    change = np.diff(motion.pose, axis=0)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        moved_mps = np.hypot(change[:, 0], change[:, 1]) / steps_s
+    speed_mps = np.abs(motion.speed_mps[:-1])
+    moving = usable & (moved_mps > MOVING_MPS) & np.isfinite(speed_mps)
+    if moving.sum() >= _FEWEST_SAMPLES:
+        ratio = float(np.median(speed_mps[moving] / moved_mps[moving]))
+        if not 1 / _UNIT_FACTOR < ratio < _UNIT_FACTOR:
+            unit = next((f" ({unit}?)" for unit, factor in _SPEED_UNITS.items() if 0.8 < ratio / factor < 1.25), "")
+            found.append(Finding("problem", f"speed_mps is {ratio:.2f} times what the pose moves by in a second; it "
+                                            f"must be in m/s{unit}, the pose in metres."))
+    far = usable & (np.hypot(change[:, 0], change[:, 1]) > _HEADING_M)
+    course_rad = np.unwrap(np.arctan2(change[far, 1], change[far, 0]))
+    turned_rad, yaw_rad = np.diff(course_rad), np.diff(motion.pose[:-1, 2][far])
+    if len(turned_rad) >= _FEWEST_SAMPLES and np.abs(turned_rad).max() > _TURNING_RADPS:
+        ratio = float((turned_rad * yaw_rad).sum() / max((turned_rad ** 2).sum(), 1e-12))
+        if ratio > 0.5 * math.degrees(1.0):
+            found.append(Finding("problem", f"yaw turns {ratio:.0f} times as much as the path: it must be in radians, "
+                                            f"not degrees."))
+    return found
 
 
 def of_alignment(fit: alignment_lib.Alignment, recording: schema.Recording) -> list[Finding]:
@@ -212,11 +181,14 @@ def of_alignment(fit: alignment_lib.Alignment, recording: schema.Recording) -> l
         return [Finding("remark", "whether lidar and camera agree could not be measured (too few clear edges); look at "
                                   "the overlay.")]
     focal_px = described.camera.intrinsics[0][0]
-    shift_rad = math.hypot(fit.right_px, fit.down_px) / focal_px
-    limit_rad = max(math.radians(1.0), 1.5 * 2 * math.pi / described.lidar.columns)
-    place = (f"{fit.right_px:+.0f} px to the right and {fit.down_px:+.0f} px down ({math.degrees(shift_rad):.1f} "
-             f"degrees)")
-    if shift_rad > limit_rad and fit.gain > 1.03:
+    degrees = math.degrees(math.atan(math.hypot(fit.right_px, fit.down_px) / focal_px))
+    place = f"{fit.right_px:+.0f} px to the right and {fit.down_px:+.0f} px down ({degrees:.1f} degrees)"
+    least_px = focal_px * math.tan(_MISALIGNED_RAD)
+    beams = math.hypot(fit.right_px / max(least_px, 1.5 * fit.column_px), fit.down_px / max(least_px, 1.5 * fit.row_px))
+    if beams > 1 and fit.gain > 1.03:
+        first = "the rotation in camera_to_ego" if fit.is_turn else "intrinsics and camera_to_ego"
         return [Finding("problem", f"lidar and camera are misaligned: the scan fits the picture best when moved by "
-                                   f"{place}. Check camera_to_ego, intrinsics and the time of both.")]
-    return [Finding("remark", f"lidar and camera agree: best fit when moved by {place}.")]
+                                   f"{place}. Check {first}, and the time of both.")]
+    row_degrees = math.degrees(math.atan(fit.row_px / focal_px))
+    return [Finding("remark", f"lidar and camera agree: best fit when moved by {place}, where rows of the lidar are "
+                              f"{row_degrees:.1f} degrees apart.")]

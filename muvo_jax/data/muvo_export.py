@@ -5,9 +5,10 @@
     OUT/runs.csv                            mode, town, run, and the run of the source that it is
 
 The plain format knows no expert's policy, no satellite position and no bird's-eye view of other cars: those columns are
-zeros, as an autopilot leaves them, and the birdview is background throughout. Frames without a recorded reward get 1,
-lest the authors' filter drop the run. Voxels are written where the recorded grid is the authors'; else make them from
-depth and lidar afterwards. Nothing here needs pandas.
+zeros, as an autopilot leaves them, and the birdview is background throughout. The weather's name is that of frames.csv,
+the town's the one that a run's name begins with, as in record_carla's (Town01_003). Frames without a recorded reward
+get 1, lest the authors' filter drop the run. Voxels are written where the recorded grid is the authors'; else make them
+from depth and lidar afterwards. Nothing here needs pandas.
 """
 
 from __future__ import annotations
@@ -15,8 +16,9 @@ from __future__ import annotations
 import csv
 import io
 import pathlib
+import re
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 
 import numpy as np
 from PIL import Image
@@ -25,8 +27,8 @@ from muvo_jax.data import (
     carla,
     carla_files,
     carla_runs,
+    carla_tags,
     description,
-    files,
     frame_pickle,
     plain,
     recorder,
@@ -39,6 +41,9 @@ _OTHER_TAG = 3
 _LAYOUT_PX = 192
 _COMMAND_FOLLOW = 4
 _BACKGROUND = 1  # bit 0
+_NO_WEATHER = "ClearNoon"  # where none is recorded
+_TOWN = re.compile(r"(Town\d+\w*?)(?:_|$)")
+_LABELS = frozenset({"depth_m", "image_classes", "point_classes"})
 _WEATHER = ("cloudiness", "fog_density", "fog_distance", "fog_falloff", "precipitation", "precipitation_deposits",
             "sun_altitude_angle", "sun_azimuth_angle", "wetness", "wind_intensity")
 
@@ -50,7 +55,7 @@ def export(source: pathlib.Path | str, out: pathlib.Path | str, *, town: str = "
     Args:
       source: a plain recording with image, depth, classes, points and route map.
       out: folder of the new recording.
-      town: name of the towns' folder; the authors' voxel step looks for Town*.
+      town: of the runs whose name does not say it; the authors' voxel step looks for Town*.
       progress: called with (frames done, frames in all).
 
     Returns:
@@ -60,8 +65,8 @@ def export(source: pathlib.Path | str, out: pathlib.Path | str, *, town: str = "
       DataError: where the source lacks what the authors' reader always opens, or a file is damaged.
       FileExistsError: where `out` holds an export of other sensors.
     """
-    source, out = pathlib.Path(source), pathlib.Path(out)
-    recording = plain.PlainRecording(source)
+    source, out = pathlib.Path(source).expanduser(), pathlib.Path(out).expanduser()
+    recording = plain.PlainRecording(source, labels=_LABELS)
     _check(recording, source)
     _describe(recording.description, out)
     runs = _plan(recording, town)
@@ -69,7 +74,7 @@ def export(source: pathlib.Path | str, out: pathlib.Path | str, *, town: str = "
     for folder, sequence in runs:
         target = out / carla_runs.VERSION_FOLDER / folder
         if not (target / carla_runs.FRAME_FILE).is_file():
-            for _ in _write_run(recording, source, sequence, target, town):
+            for _ in _write_run(recording, sequence, target):
                 written += 1
                 if progress is not None:
                     progress(written, total)
@@ -82,19 +87,21 @@ def export(source: pathlib.Path | str, out: pathlib.Path | str, *, town: str = "
 
 def _check(recording: plain.PlainRecording, source: pathlib.Path) -> None:
     described = recording.description
-    lacking = sorted({"image", "points_m", "route_map"} - described.modalities)
-    first = source / recording.sequences[0].name
-    lacking += [name for name in ("depth", "classes") if not (first / name).is_dir()]
-    if lacking:
+    names = {"image": "image", "points_m": "points_m", "route_map": "route_map", "depth_m": "depth",
+             "image_classes": "classes"}
+    there = schema.in_every_frame(recording)
+    lacking = [name for field, name in names.items() if field not in there]
+    if lacking or described.lidar is None:
         raise schema.DataError(f"{source}: the authors' reader always opens image, depth, classes, points and route "
                                f"map; this recording has no {', '.join(lacking)}.")
 
 
 def _describe(described: schema.RecordingDescription, out: pathlib.Path) -> None:
     voxels = described.voxels if described.voxels == carla.VOXELS else None
-    text = recorder.to_toml({"rate_hz": described.rate_hz},
+    route_map = described.route_map if described.route_map != carla.ROUTE_MAP else None
+    text = recorder.to_toml({"rate_hz": described.rate_hz, "tags": carla_tags.OLDER},
                             description.tables(camera=described.camera, lidar=described.lidar,
-                                               action=described.contract, voxels=voxels))
+                                               action=described.contract, voxels=voxels, route_map=route_map))
     path = out / carla.SENSORS_FILE
     if path.is_file() and path.read_text(encoding="utf-8") != text:
         raise FileExistsError(f"{path} describes other sensors; choose another folder or remove this one.")
@@ -106,17 +113,18 @@ def _plan(recording: plain.PlainRecording, town: str) -> list[tuple[str, schema.
     """(mode/town/run, sequence): "train" stays, the other splits become val0, val1, ... in their order."""
     others = [split for split in recording.description.splits if split != "train"]
     modes = {"train": "train"} | {split: f"val{index}" for index, split in enumerate(others)}
-    counts = dict.fromkeys(modes.values(), 0)
+    counts: dict[str, int] = {}
     plan = []
     for sequence in recording.sequences:
-        mode = modes[sequence.split]
-        plan.append((f"{mode}/{town}/{counts[mode]:04d}", sequence))
-        counts[mode] += 1
+        named = _TOWN.match(sequence.name.rsplit("/", 1)[-1])
+        folder = f"{modes[sequence.split]}/{named[1] if named else town}"
+        number = counts.setdefault(folder, 0)
+        counts[folder] += 1
+        plan.append((f"{folder}/{number:04d}", sequence))
     return plan
 
 
-def _write_run(recording: plain.PlainRecording, source: pathlib.Path, sequence: schema.Sequence, target: pathlib.Path,
-               town: str):
+def _write_run(recording: plain.PlainRecording, sequence: schema.Sequence, target: pathlib.Path) -> Iterator[int]:
     """Writes one run, the data frame last; yields after each frame."""
     shutil.rmtree(target, ignore_errors=True)
     for kind in (*carla_files.KINDS, "image_left", "image_right", "image_all"):
@@ -128,19 +136,21 @@ def _write_run(recording: plain.PlainRecording, source: pathlib.Path, sequence: 
     rows = []
     for index in range(sequence.length):
         frame = recording.read(sequence, index)
-        _write_frame(frame, described, source / sequence.name, target, index)
+        _write_frame(frame, recording, target, index)
         rows.append(frame)
         yield index
-    content = frame_pickle.frame(_columns(rows, town, has_voxels))
+    weathers = recording.words(sequence, "weather") or [""] * len(rows)
+    content = frame_pickle.frame(_columns(rows, target.parent.name, [name or _NO_WEATHER for name in weathers],
+                                          has_voxels))
     draft = target / f".{carla_runs.FRAME_FILE}.part"
     draft.write_bytes(content)
     draft.replace(target / carla_runs.FRAME_FILE)
 
 
-def _write_frame(frame: schema.RawFrame, described: schema.RecordingDescription, source: pathlib.Path,
-                 target: pathlib.Path, number: int) -> None:
-    frame_id = int(frame["frame_id"])
+def _write_frame(frame: schema.RawFrame, recording: plain.PlainRecording, target: pathlib.Path, number: int) -> None:
+    described = recording.description
     assert described.lidar is not None
+    tags_of = _layout_tags(recording)
 
     def path(kind: str) -> pathlib.Path:
         return target / carla_files.file_name(kind, number)
@@ -149,20 +159,34 @@ def _write_frame(frame: schema.RawFrame, described: schema.RecordingDescription,
         Image.fromarray(np.ascontiguousarray(pixels)).save(path(kind), compress_level=1)
 
     save("image", frame["image"])
-    depth_m = plain.decode_depth(files.read_image(source / "depth" / f"{frame_id:06d}.png", None))
-    classes = files.read_image(source / "classes" / f"{frame_id:06d}.png", "L")
-    tags = TOWN_TAGS[np.minimum(classes, len(TOWN_TAGS) - 1)] if described.name == "town" else classes
-    save("depth_semantic", np.concatenate([carla_files.encode_depth(depth_m), tags[..., None]], axis=-1))
+    save("depth_semantic", np.concatenate([carla_files.encode_depth(frame["depth_m"]),
+                                           tags_of[frame["image_classes"]][..., None]], axis=-1))
     route = frame["route_map"]
     save("routemap", np.where(np.kron(route, np.ones((_LAYOUT_PX // route.shape[0],) * 2, np.uint8)) > 127, 255, 0)
          .astype(np.uint8))
     save("birdview", np.full((_LAYOUT_PX, _LAYOUT_PX), _BACKGROUND, np.uint16))
-    hit = point_tags(source / "lidar" / f"{frame_id:06d}.npz", len(frame["points_m"]))
+    hit = tags_of[frame["point_classes"]] if "point_classes" in frame else np.full(len(frame["points_m"]), _OTHER_TAG,
+                                                                                  np.uint8)
     path("points_semantic").write_bytes(frame_pickle.npy_of_dict(
         {"points_xyz": to_lidar_frame(frame["points_m"], described.lidar.position_m), "ObjTag": hit}))
     if described.voxels == carla.VOXELS and "occupancy" in frame:
         z, y, x = np.nonzero(frame["occupancy"].transpose(2, 1, 0) == 1)
         np.save(path("voxel"), np.stack([x, y, z, np.full(len(x), _OTHER_TAG)], axis=1).astype(np.uint16))
+
+
+def _layout_tags(recording: plain.PlainRecording) -> np.ndarray:
+    """uint8 [256], class of the recording -> tag of the layout, by name; without names they are the layout's already.
+
+    The town names none and has its own.
+    """
+    names = recording.stated_classes
+    tags = np.arange(256, dtype=np.uint8)
+    if names:
+        known = {name: tag for tag, name in enumerate(carla_files.CLASSES)}
+        tags[:len(names)] = [known.get(name, _OTHER_TAG) for name in names]
+    elif recording.description.name == "town":
+        tags[:len(TOWN_TAGS)] = TOWN_TAGS
+    return tags
 
 
 def to_lidar_frame(points_m: np.ndarray, lidar_position_m: tuple[float, float, float]) -> np.ndarray:
@@ -172,14 +196,7 @@ def to_lidar_frame(points_m: np.ndarray, lidar_position_m: tuple[float, float, f
     return np.asfortranarray(moved)
 
 
-def point_tags(path: pathlib.Path, count: int) -> np.ndarray:
-    """What each point hit, uint8 [count]; "other" where the recording does not say."""
-    with np.load(path, allow_pickle=False) as arrays:
-        tags = arrays["point_tags"] if "point_tags" in arrays else np.full(count, _OTHER_TAG)
-    return tags.astype(np.uint8) if len(tags) == count else np.full(count, _OTHER_TAG, np.uint8)
-
-
-def _columns(rows: list[schema.RawFrame], town: str, has_voxels: bool) -> dict:
+def _columns(rows: list[schema.RawFrame], town: str, weathers: list[str], has_voxels: bool) -> dict:
     """All columns in the order of DataWriter (and generate_voxels), with its types."""
     count = len(rows)
 
@@ -208,7 +225,7 @@ def _columns(rows: list[schema.RawFrame], town: str, has_voxels: bool) -> dict:
     columns |= {f"{kind}_path": paths(kind) for kind in ("image", "depth_semantic", "birdview", "routemap",
                                                          "points_semantic")}
     columns |= {"n_classes": np.full(count, len(carla_files.BIRDVIEW_BITS), np.int64),
-                "is_expert": np.ones(count, bool), "weather": ["ClearNoon"] * count, "town": [town] * count,
+                "is_expert": np.ones(count, bool), "weather": weathers, "town": [town] * count,
                 "n_vehicles": [[0, 0]] * count, "n_walkers": [[0, 0]] * count, "route_id": np.zeros(count, np.int64),
                 "env_id": ["Endless-v0"] * count}
     columns |= {name: np.zeros(count, np.float64) for name in _WEATHER}

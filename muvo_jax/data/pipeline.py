@@ -40,6 +40,8 @@ class Frames:
         self.config = config
         self.cache = windows_lib.FrameCache(int(config.data.cache_gib * 2**30))
         self._actions = windows_lib.StepActions(recording)
+        self.needs = prepare.needed(config, recording.description.modalities)
+        self._not_in_all = recording.description.modalities - schema.in_every_frame(recording) - self.needs
 
     def get(self, sequence: schema.Sequence, index: int) -> prepare.PreparedFrame:
         """Frame `index` of `sequence`; called from several threads at once."""
@@ -84,7 +86,10 @@ class Frames:
                          for window in windows])
 
     def _make(self, sequence: schema.Sequence, index: int) -> prepare.PreparedFrame:
-        return prepare.prepare_frame(self.recording.read(sequence, index), self.config)
+        raw = self.recording.read(sequence, index)
+        for name in self._not_in_all:  # frames of one batch have the same fields
+            raw.pop(name, None)  # type: ignore[misc]
+        return prepare.prepare_frame(raw, self.config)
 
 
 class TrainBatches:
@@ -108,7 +113,8 @@ class TrainBatches:
           DataError: where no training window fits, or the state belongs to another stream.
         """
         data = frames.config.data
-        windows = windows_lib.find_windows(frames.recording, "train", frames=data.frames, stride=data.stride)
+        windows = windows_lib.find_windows(frames.recording, "train", frames=data.frames, stride=data.stride,
+                                           needs=frames.needs)
         size = batch or frames.config.train.batch
         self.windows_per_epoch = len(windows)
         if size % (processes * accumulate) or not 0 <= process < processes:
@@ -186,8 +192,8 @@ def evaluation_batches(frames: Frames, split: str, *, windows: int, length: int 
     data = frames.config.data
     length = length or data.context + data.horizon
     size = batch or frames.config.evaluation.batch
-    chosen = windows_lib.spread(windows_lib.find_windows(frames.recording, split, frames=length, stride=data.stride),
-                                windows)
+    found = windows_lib.find_windows(frames.recording, split, frames=length, stride=data.stride, needs=frames.needs)
+    chosen = windows_lib.spread(found, windows)
     return _padded_batches(frames, chosen, size)
 
 

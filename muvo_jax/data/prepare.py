@@ -33,6 +33,8 @@ _MADE_OF = {"ego_motion": frozenset({"pose", "speed_mps"}), "range_view_classes"
 _JUDGED = frozenset({"ego_motion", "image_moving_mask", "occupancy_moving_mask"})
 DEPTH_LIMIT_M = 100.0  # what is farther counts as nothing
 UNLABELLED = 255
+# Targets that a batch may lack: heads that learn from them are refused by check_targets.
+_OPTIONAL = frozenset({"reward", "is_terminal"})
 NAVIGATION = ("command", "next_command", "target_m", "next_target_m")
 
 PreparedFrame = dict[str, np.ndarray | np.generic]  # names and dtypes of types.Batch without B and T
@@ -64,9 +66,12 @@ def adapt(config: config_lib.Config, recording: schema.Recording, *, keep: Colle
     """
     description = recording.description
     notes: list[str] = []
-    model = _fit_first_guess(_fit_model(config.model, description, notes), description, keep, notes)
-    data = _fit_windows(config.data, recording, keep, notes)
     contract = dataclasses.replace(description.contract, step_action=config.contract.step_action)
+    model = _fit_first_guess(_fit_model(config.model, description, notes), description, keep, notes)
+    needs = needed(dataclasses.replace(config, model=model, contract=contract), description.modalities)
+    data = _fit_windows(config.data, recording, keep, needs, notes)
+    if description.route_map is not None:
+        data = dataclasses.replace(data, route_map=description.route_map)
     train = config.train
     if train.observe_frames > data.context and "train.observe_frames" not in keep:  # as many as evaluation observes
         train = dataclasses.replace(train, observe_frames=data.context)
@@ -83,6 +88,10 @@ def prepare_frame(raw: schema.RawFrame, config: config_lib.Config) -> PreparedFr
       DataError: where the frame does not fit the config, naming frame and field.
     """
     model = config.model
+    lacking = sorted(needed(config, raw.keys()) - raw.keys())
+    if lacking:
+        raise schema.DataError(f"frame {int(raw['frame_id'])} has no {', '.join(lacking)}, which the model needs. "
+                               f"Choose windows of sequences that have it (schema.Sequence.has).")
     ready: PreparedFrame = {name: raw[name] for name in ("action", "timestamp_s", "frame_id")}
     try:
         if model.camera != config_lib.NO_SENSOR or "image" in config.targets:
@@ -142,6 +151,22 @@ def _labels(raw: schema.RawFrame, config: config_lib.Config) -> PreparedFrame:
         classes = np.append(raw["point_classes"], np.uint8(UNLABELLED))  # where no point is, its number is -1
         ready["range_view_classes"] = classes[winner]
     return ready
+
+
+def needed(config: config_lib.Config, modalities: Collection[str]) -> frozenset[str]:
+    """The keys of RawFrame that `prepare_frame` must find, of a recording with these modalities."""
+    model, targets = config.model, config.targets
+    names = {"action", "timestamp_s", "frame_id"} | (_recorded(targets) - _OPTIONAL)
+    if model.camera != config_lib.NO_SENSOR or "image" in targets:
+        names |= {"image", "intrinsics", "camera_to_ego"}
+    if model.lidar != config_lib.NO_SENSOR or "range_view" in targets:
+        names.add("points_m")
+    if "occupancy" in model.heads:
+        names.add("occupancy" if "occupancy" in modalities else "points_m")
+    names |= set(NAVIGATION) if model.navigation else set()
+    speed = model.speed or (model.tracks_motion and model.kinematics is not None)
+    names |= {name for name, wanted in (("route_map", model.route), ("speed_mps", speed)) if wanted}
+    return frozenset(names)
 
 
 def labels(config: config_lib.Config) -> frozenset[str]:
@@ -310,8 +335,8 @@ def _by(shape: tuple[int, ...]) -> str:
 
 
 def _fit_windows(data: config_lib.DataConfig, recording: schema.Recording, keep: Collection[str],
-                 notes: list[str]) -> config_lib.DataConfig:
-    lengths = {split: schema.longest(recording.sequences, split) for split in recording.description.splits}
+                 needs: Collection[str], notes: list[str]) -> config_lib.DataConfig:
+    lengths = {split: schema.longest(recording.sequences, split, needs) for split in recording.description.splits}
     if lengths.get("train", 0) < SHORT_RECORDING_FRAMES and _too_long(data, lengths):
         changes: dict = {name: value for name, value in _SHORT.items() if f"data.{name}" not in keep}
         data = dataclasses.replace(data, **changes)
@@ -321,7 +346,7 @@ def _fit_windows(data: config_lib.DataConfig, recording: schema.Recording, keep:
     split = _too_long(data, lengths)
     if split:
         frames = data.frames if split == "train" else data.context + data.horizon
-        raise too_short(recording, split, frames, data.stride)
+        raise too_short(recording, split, frames, data.stride, needs)
     return data
 
 
@@ -339,10 +364,18 @@ def span(frames: int, stride: int) -> int:
     return (frames - 1) * stride + 1
 
 
-def too_short(recording: schema.Recording, split: str, frames: int, stride: int) -> schema.DataError:
-    """The error for a split without a single window; names both lengths."""
-    found = schema.longest(recording.sequences, split)
-    return schema.DataError(f"recording {recording.description.name!r}: the longest gap-free sequence of split "
-                            f"{split!r} has {found} frames, but a window of {frames} frames at stride {stride} needs "
+def too_short(recording: schema.Recording, split: str, frames: int, stride: int,
+              needs: Collection[str] = ()) -> schema.DataError:
+    """The error for a split without a single window of frames that have what is needed; names both lengths."""
+    found = schema.longest(recording.sequences, split, needs)
+    every = schema.longest(recording.sequences, split)
+    start = f"recording {recording.description.name!r}: the longest gap-free sequence of split {split!r}"
+    if every >= span(frames, stride) > found:
+        lacking = sorted({name for sequence in recording.sequences if sequence.split == split
+                          for name in sequence.lacks if name in needs})
+        return schema.DataError(f"{start} that has {', '.join(lacking)} has {found} frames, but a window needs "
+                                f"{span(frames, stride)}. Record these for that split too, or train a model that does "
+                                f"not need them.")
+    return schema.DataError(f"{start} has {found} frames, but a window of {frames} frames at stride {stride} needs "
                             f"{span(frames, stride)}. Choose fewer frames (data.frames, data.context, data.horizon) or "
                             f"a smaller data.stride, or record longer runs.")

@@ -6,78 +6,81 @@ import contextlib
 import multiprocessing
 import os
 import pathlib
-from collections.abc import Callable, Iterable, Iterator, Sequence
+import signal
+import threading
+from collections.abc import Callable, Iterable, Iterator
+from concurrent import futures
+from concurrent.futures import process
+from typing import Any, TypeVar
 
-try:
-    import fcntl
-except ImportError:  # Windows: there it is up to the user not to work on one folder twice at once
-    fcntl = None  # type: ignore[assignment]
+import filelock
+
+_Result = TypeVar("_Result")
+_shared: tuple = ()  # of a worker: what all of its tasks need
 
 
-def stream(work: Callable[..., Iterable], shares: Sequence[tuple], doing: str) -> Iterator:
-    """Runs `work(*share)` in a process for each share; yields what they yield, as it comes.
+def processors() -> int:
+    """How many processors this process may use: what a number of workers is where none is asked for."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def spread(work: Callable[..., _Result], tasks: Iterable[Any], *, shared: tuple, workers: int,
+           doing: str) -> Iterator[_Result]:
+    """Runs `work(*shared, task)` for each task in that many processes; yields results as they come, in any order.
 
     Args:
       work: a function of a module, so that a fresh process finds it.
-      shares: its arguments, picklable.
+      tasks: picklable, one at a time.
+      shared: arguments for all tasks, picklable; each process gets them once.
       doing: such as "packing", for messages.
 
     Raises:
-      RuntimeError: where a process ends with a ValueError or OSError (its message is told), or is killed.
+      Exception: what `work` raises, as it is; tasks that have not begun are given up.
+      RuntimeError: where a process is killed.
     """
-    context = multiprocessing.get_context("spawn")
-    receiver, sender = context.Pipe(duplex=False)
-    lock = context.Lock()
-    processes = [context.Process(target=_work, args=(work, share, sender, lock, os.getpid()), daemon=True)
-                 for share in shares]
-    for process in processes:
-        process.start()
-    sender.close()  # then the end of the last worker ends the stream
+    pool = futures.ProcessPoolExecutor(workers, multiprocessing.get_context("spawn"), _begin, (shared,))
     try:
-        while True:
-            value, fault = receiver.recv()
-            if fault is not None:
-                raise RuntimeError(f"a {doing} process failed: {fault}")
-            yield value
-    except EOFError:  # all is told; on a busy machine the workers may take a while to leave
-        for process in processes:
-            process.join()
+        for future in futures.as_completed([pool.submit(_run, work, task) for task in tasks]):
+            yield future.result()
+    except process.BrokenProcessPool as error:
+        raise RuntimeError(f"a {doing} process was killed (is memory short?); run again, what is complete is "
+                           f"kept.") from error
     finally:
-        for process in processes:
-            if process.is_alive() and process.exitcode is None:
-                process.join(timeout=1.0)
-                process.terminate()
-            process.join()
-    codes = [process.exitcode for process in processes if process.exitcode]
-    if codes:
-        raise RuntimeError(f"{len(codes)} of {len(shares)} {doing} processes ended with exit code {codes[0]}; run "
-                           f"again, what is complete is kept.")
+        pool.shutdown(cancel_futures=True)
 
 
-def _work(work: Callable[..., Iterable], share: tuple, sender, lock, parent: int) -> None:
-    try:
-        for value in work(*share):
-            if os.getppid() != parent:  # killed: nobody would hold the lock for us
-                os._exit(1)
-            with lock:
-                sender.send((value, None))
-    except (ValueError, OSError) as error:
-        with lock:
-            sender.send((None, str(error)))
+def _begin(shared: tuple) -> None:
+    global _shared
+    _shared = shared
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the command's own process tells the others to stop
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+
+
+def _end_with_parent() -> None:
+    """Where the command is killed, nobody would hold its lock for us."""
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        parent.join()
+        os._exit(1)
+
+
+def _run(work: Callable[..., _Result], task: Any) -> _Result:
+    return work(*_shared, task)
 
 
 @contextlib.contextmanager
-def locked(path: pathlib.Path, doing: str) -> Iterator[None]:
+def locked(path: pathlib.Path, doing: str, *, wait: bool = False) -> Iterator[None]:
     """Keeps a second process out that locks the same file; the lock falls with the process, however it ends.
+
+    Args:
+      wait: for the other process, instead of an error.
 
     Raises:
       BlockingIOError: where another process holds the lock now.
     """
-    with path.open("w") as file:
-        if fcntl is not None:
-            try:
-                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except BlockingIOError as error:
-                raise BlockingIOError(f"{path.parent}: another process is {doing} here now; wait for it, or choose "
-                                      f"another folder.") from error
-        yield
+    try:
+        with filelock.FileLock(path, blocking=wait):
+            yield
+    except filelock.Timeout as error:
+        raise BlockingIOError(f"{path.parent}: another process is {doing} here now; wait for it, or choose another "
+                              f"folder.") from error

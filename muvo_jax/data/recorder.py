@@ -1,8 +1,8 @@
 """Writes the plain recording format that plain.py reads: folders of PNG, NPZ, CSV and TOML, nothing pickled.
 
 A run counts once its frames.csv is there, and that is written last, by renaming: whatever interrupts a recording leaves
-either a complete run or one that readers ignore, and recording again goes on where it stopped. Beside what plain.py
-reads, depth maps (16-bit PNG, centimetres, 65535 in the sky) and class images are kept for people and other models.
+either a complete run or one that readers ignore, and recording again goes on where it stopped. Depth maps (16-bit PNG,
+centimetres, 65535 in the sky) and class images are kept for people and other models, too.
 """
 
 from __future__ import annotations
@@ -20,29 +20,37 @@ import numpy as np
 from PIL import Image
 
 from muvo_jax import config as config_lib
-from muvo_jax.data import description, plain, schema
+from muvo_jax.data import description, fields, frames_table, plain, schema
 
 COLUMNS = ("frame_id", "timestamp_s", "x_m", "y_m", "yaw_rad", "speed_mps", "acceleration", "steering", "reward",
            "is_terminal", "weather")
 DEPTH_UNIT_M, DEPTH_SKY = plain.DEPTH_UNIT_M, plain.DEPTH_SKY
-_IMAGES = ("image", "classes", "route_map")
-_MOVING = ("image_moving_mask", "occupancy_moving_mask")
-_ARRAYS = {"points_m": "lidar", "occupancy": "occupancy"}
+_NO_FILE = fields.Field("", np.uint8)
+# Names of RawFrame and what recorders call them: both are taken.
+_ALIASES = {"classes": "image_classes", "point_tags": "point_classes"}
+# Of RawFrame, but kept in the description, or made of another field.
+_NOT_WRITTEN = ("intrinsics", "camera_to_ego", "image_instance_mask")
+KEYS = frozenset((*COLUMNS, *fields.COLUMNS, *fields.FIELDS, *_ALIASES))
 
 
 def write_description(root: pathlib.Path | str, *, name: str, rate_hz: float, splits: tuple[str, ...],
                       contract: config_lib.ActionContract, camera: schema.Camera | None = None,
                       lidar: config_lib.RangeViewGeometry | None = None,
-                      voxels: config_lib.VoxelGrid | None = None) -> pathlib.Path:
+                      voxels: config_lib.VoxelGrid | None = None, classes: tuple[str, ...] = (),
+                      route_map: config_lib.RouteMap | None = None) -> pathlib.Path:
     """Writes ROOT/recording.toml, what holds for every run; sensors that are None are left out.
+
+    Args:
+      classes: names of the classes, in their order; readers take the town's (fields.TOWN_CLASSES) where there are none.
+      route_map: scale of the route maps; None is the town's.
 
     Raises:
       FileExistsError: where ROOT holds a different description (runs of different settings must not be mixed).
     """
-    root = pathlib.Path(root)
+    root = pathlib.Path(root).expanduser()
     text = to_toml({"schema_version": plain.SCHEMA_VERSION, "name": name, "rate_hz": float(rate_hz),
-                    "splits": list(splits)},
-                   description.tables(action=contract, camera=camera, lidar=lidar, voxels=voxels))
+                    "splits": list(splits)} | ({"classes": list(classes)} if classes else {}),
+                   description.tables(action=contract, camera=camera, lidar=lidar, voxels=voxels, route_map=route_map))
     path = root / plain.DESCRIPTION_FILE
     if path.exists():
         if path.read_text(encoding="utf-8") != text:
@@ -56,7 +64,7 @@ def write_description(root: pathlib.Path | str, *, name: str, rate_hz: float, sp
 
 def is_complete(root: pathlib.Path | str, split: str, run: str) -> bool:
     """Whether a run was recorded to its end, so that it need not be recorded again."""
-    return (pathlib.Path(root) / split / run / plain.FRAMES_FILE).is_file()
+    return (pathlib.Path(root).expanduser() / split / run / plain.FRAMES_FILE).is_file()
 
 
 class RunWriter:
@@ -67,62 +75,92 @@ class RunWriter:
 
     def __init__(self, root: pathlib.Path | str, split: str, run: str):
         """Raises FileExistsError where the run is complete already."""
-        self.folder = pathlib.Path(root) / split / run
+        self.folder = pathlib.Path(root).expanduser() / split / run
         if is_complete(root, split, run):
             raise FileExistsError(f"{self.folder} is recorded already; remove it to record it again.")
         shutil.rmtree(self.folder, ignore_errors=True)
         self.folder.mkdir(parents=True)
-        self._rows: list[list[str]] = []
+        self._rows: list[dict[str, str]] = []
 
     def write(self, frame: Mapping) -> None:
         """Writes the files of one frame.
 
         Args:
-          frame: frame_id (int) and timestamp_s; the other names of COLUMNS as far as they are known; and any of
-            image uint8 [H, W, 3], depth_m float [H, W] (infinite in the sky), classes and route_map uint8 [H, W],
+          frame: either as a reader gives it (schema.RawFrame), which is then read back bit for bit; or frame_id (int)
+            and timestamp_s, the other names of COLUMNS as far as they are known, and any of image uint8 [H, W, 3],
+            depth_m float [H, W] (infinite in the sky; centimetres are kept), classes and route_map uint8 [H, W],
             image_moving_mask bool [H, W] and occupancy_moving_mask bool [X, Y, Z],
             points_m float [N, 3] (with point_tags uint8 [N], what each hit), occupancy uint8 [X, Y, Z],
             birds_eye_classes uint8 [X, Y] with birds_eye_instances int32 [X, Y].
 
         Raises:
-          ValueError: where frame_id does not increase.
+          ValueError: where frame_id does not increase, a name is unknown (naming the nearest), or DataError where a
+            field is of another shape or has numbers that it cannot have.
         """
+        fields.unknown(frame, KEYS, f"{self.folder}: field")
         frame_id = int(frame["frame_id"])
-        if self._rows and frame_id <= int(self._rows[-1][0]):
-            raise ValueError(f"frame_id {frame_id} after {self._rows[-1][0]}: frames must be written in order.")
-        for name in _IMAGES:
-            if name in frame:
-                self._save_png(name, frame_id, frame[name])
-        if "depth_m" in frame:
-            self._save_png("depth", frame_id, encode_depth(frame["depth_m"]))
-        for name, folder in _ARRAYS.items():
-            if name in frame:
-                arrays = {name: np.asarray(frame[name], np.float32 if name == "points_m" else np.uint8)}
-                if name == "points_m" and "point_tags" in frame:
-                    arrays["point_tags"] = np.asarray(frame["point_tags"], np.uint8)
-                self._path(folder, frame_id, ".npz").write_bytes(npz_bytes(arrays))
-        if "birds_eye_classes" in frame:
-            arrays = {"birds_eye_classes": np.asarray(frame["birds_eye_classes"], np.uint8),
-                      "birds_eye_instances": np.asarray(frame["birds_eye_instances"], np.int32)}
-            self._path("birds_eye", frame_id, ".npz").write_bytes(npz_bytes(arrays))
-        if moving := {name: np.asarray(frame[name], bool) for name in _MOVING if name in frame}:
-            self._path("moving", frame_id, ".npz").write_bytes(npz_bytes(moving))
-        self._rows.append([_cell(frame.get(name, "")) for name in COLUMNS])
+        where = f"{self.folder}, frame {frame_id}"
+        if self._rows and frame_id <= int(self._rows[-1]["frame_id"]):
+            raise ValueError(f"frame_id {frame_id} after {self._rows[-1]['frame_id']}: frames must be written in "
+                             f"order.")
+        row = _row(frame, where)
+        arrays = {name: fields.conform(name, value, where) for key, value in frame.items()
+                  if fields.FIELDS.get(name := _ALIASES.get(key, key), _NO_FILE).folder and name not in _NOT_WRITTEN}
+        depth_m = arrays.pop("depth_m", None)
+        if depth_m is not None:
+            self._write_depth(frame_id, depth_m, exactly="action" in frame)
+        packed: dict[str, dict[str, np.ndarray]] = {}
+        for name, array in arrays.items():
+            field = fields.FIELDS[name]
+            if field.array:
+                packed.setdefault(field.folder, {})[field.array] = array
+            else:
+                self._save_png(field.folder, frame_id, array)
+        for folder, contents in packed.items():
+            self._path(folder, frame_id, ".npz").write_bytes(npz_bytes(contents))
+        self._rows.append(row)
 
     def close(self) -> None:
         """Completes the run."""
         table = io.StringIO(newline="")
-        csv.writer(table, lineterminator="\n").writerows([COLUMNS, *self._rows])
+        more = [name for name in fields.COLUMNS if name not in COLUMNS and any(name in row for row in self._rows)]
+        writer = csv.DictWriter(table, (*COLUMNS, *more), restval="", lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(self._rows)
         write_atomically(self.folder / plain.FRAMES_FILE, table.getvalue())
 
     def _path(self, folder: str, frame_id: int, suffix: str) -> pathlib.Path:
         path = self.folder / folder / f"{frame_id:06d}{suffix}"
-        if not self._rows:
-            path.parent.mkdir(exist_ok=True)
+        path.parent.mkdir(exist_ok=True)
         return path
+
+    def _write_depth(self, frame_id: int, depth_m: np.ndarray, *, exactly: bool) -> None:
+        """As centimetres; where these would not give the same numbers again, and that is asked for, as they are."""
+        centimetres = encode_depth(depth_m)
+        if exactly and not np.array_equal(plain.decode_depth(centimetres), depth_m):
+            self._path("depth", frame_id, ".npz").write_bytes(npz_bytes({"depth_m": depth_m}))
+        else:
+            self._save_png("depth", frame_id, centimetres)
 
     def _save_png(self, folder: str, frame_id: int, pixels: np.ndarray) -> None:
         Image.fromarray(np.ascontiguousarray(pixels)).save(self._path(folder, frame_id, ".png"), compress_level=1)
+
+
+def _row(frame: Mapping, where: str) -> dict[str, str]:
+    """A line of frames.csv: the columns of the table of fields, and the weather.
+
+    Raises:
+      DataError: for a number that its field cannot have.
+    """
+    row = {name: _cell(frame[name]) for name in COLUMNS if name in frame}
+    for name, field in fields.FIELDS.items():
+        if name in frame and field.columns:
+            values = np.atleast_1d(fields.conform(name, frame[name], where))
+            row = {column: _cell(value) for column, value in zip(field.columns, values, strict=True)} | row
+    for column, field in fields.COLUMNS.items():
+        if column in frame and field.shape:
+            frames_table.number(row[column], field, f"{where}: {column}")
+    return row
 
 
 def encode_depth(depth_m: np.ndarray) -> np.ndarray:

@@ -10,32 +10,35 @@ and a CRC-32 of all of it closes it. Nothing is pickled.
 
 from __future__ import annotations
 
+import collections
 import dataclasses
-import hashlib
 import io
 import json
+import math
 import pathlib
 import struct
 import threading
 import warnings
 import zlib
-from collections.abc import Collection
+from collections.abc import Collection, Iterator
 from typing import Any, Literal
 
 import numpy as np
 from array_record.python import array_record_module
 from PIL import Image
 
-from muvo_jax import config as config_lib
-from muvo_jax.data import description as description_lib
-from muvo_jax.data import files, schema
+from muvo_jax.data import manifest as manifest_lib
+from muvo_jax.data import schema
 
-SCHEMA_VERSION = 1
-MANIFEST_FILE = "manifest.json"
 _READER_OPTIONS = "readahead_buffer_size:0,max_parallelism:0"  # random access
 _READER_BUFFER_BYTES = 1 << 16
 _LENGTH = struct.Struct("<I")
 _ENCODINGS = ("raw", "zlib", "png", "jpeg", "float16")
+_OPEN_READERS = 32  # each holds a file open, of which a process may have 256 or 1024
+_LARGEST_ARRAY_BYTES = 1 << 30  # what a field of a frame may claim before memory is taken for it
+# What headers, arrays and pictures that are anything at all can lead to.
+_MALFORMED = (ValueError, KeyError, TypeError, AttributeError, OSError, OverflowError, RecursionError, MemoryError,
+              SyntaxError, struct.error, zlib.error, Image.DecompressionBombError)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -95,7 +98,7 @@ def decode_frame(record: bytes, where: str, only: Collection[str] | None = None)
                 continue
             array = _decode(content, field["encoding"], np.dtype(field["dtype"]), tuple(field["shape"]))
             frame[field["name"]] = array if array.ndim else array[()]
-    except (ValueError, KeyError, TypeError, OSError, zlib.error) as error:
+    except _MALFORMED as error:
         raise _damaged(where, str(error)) from error
     return frame  # type: ignore[return-value]
 
@@ -103,10 +106,12 @@ def decode_frame(record: bytes, where: str, only: Collection[str] | None = None)
 class PackedRecording:
     """A folder of shards."""
 
-    def __init__(self, path: pathlib.Path | str, *, corrupt: Literal["raise", "skip"] = "raise"):
+    def __init__(self, path: pathlib.Path | str, *, corrupt: Literal["raise", "skip"] = "raise",
+                 labels: Collection[str] = schema.LABELS):
         """Reads the manifest and looks at every shard.
 
         Args:
+          labels: which of schema.LABELS the frames should have, where they are packed.
           corrupt: "raise" compares sizes now and checksums of frames as they are read, and stops at the first that is
             wrong; "skip" compares the checksums of all shards now (one pass over the data) and leaves the frames of
             damaged ones out, with a warning that names and counts them.
@@ -115,13 +120,14 @@ class PackedRecording:
           DataError: for an incomplete or malformed manifest, or a shard that is missing or damaged.
         """
         self._root = pathlib.Path(path)
-        manifest = read_manifest(self._root)
+        manifest = manifest_lib.read_manifest(self._root)
         self._shards: list[dict] = manifest["shards"]
         self._frames_per_shard = int(manifest["frames_per_shard"])
-        self._readers: dict[int, Any] = {}
+        self._unwanted = schema.LABELS - set(labels)
+        self._readers: collections.OrderedDict[int, Any] = collections.OrderedDict()  # the one used last is last
         self._lock = threading.Lock()
         damaged = {number: fault for number, shard in enumerate(self._shards)
-                   if (fault := shard_fault(self._root, shard, checksum=corrupt == "skip"))}
+                   if (fault := manifest_lib.shard_fault(self._root, shard, checksum=corrupt == "skip"))}
         if damaged and corrupt == "raise":
             number, fault = next(iter(damaged.items()))
             raise _damaged(str(self._root / self._shards[number]["file"]),
@@ -131,11 +137,10 @@ class PackedRecording:
         kept: list[schema.Sequence] = []
         record = 0
         for sequence in whole:
-            numbers = np.arange(record, record + sequence.length)
-            present = ~np.isin(numbers // self._frames_per_shard, list(damaged))
-            for start, length in files.gap_free(present, np.zeros(sequence.length, bool)):
-                kept.append(dataclasses.replace(sequence, start=sequence.start + start, length=length))
-                self._first[(sequence.name, sequence.start + start)] = record + start
+            for start, stop in self._present(record, record + sequence.length, damaged):
+                begin = sequence.start + start - record
+                kept.append(dataclasses.replace(sequence, start=begin, length=stop - start))
+                self._first[(sequence.name, begin)] = start
             record += sequence.length
         self.sequences = tuple(kept)
         if damaged:
@@ -143,7 +148,35 @@ class PackedRecording:
             names = ", ".join(f"{self._shards[number]['file']} ({fault})" for number, fault in damaged.items())
             warnings.warn(f"{self._root}: {len(damaged)} of {len(self._shards)} shards are damaged and skipped, "
                           f"{lost} of {record} frames are lost: {names}.", schema.DataWarning, stacklevel=2)
-        self.description = _description(manifest, self._root / MANIFEST_FILE)
+        described = manifest_lib.read_description(manifest, self._root / manifest_lib.MANIFEST_FILE)
+        self.description = dataclasses.replace(described, modalities=described.modalities - self._unwanted)
+
+    def _present(self, first: int, end: int, damaged: Collection[int]) -> Iterator[tuple[int, int]]:
+        """(start, stop) of the records from `first` to `end` that lie in whole shards, without a gap each."""
+        begin = first
+        for shard in range(first // self._frames_per_shard, -(-end // self._frames_per_shard)):
+            if shard not in damaged:
+                continue
+            stop = max(first, shard * self._frames_per_shard)
+            if stop > begin:
+                yield begin, stop
+            begin = (shard + 1) * self._frames_per_shard
+        if end > begin:
+            yield begin, end
+
+    def __getstate__(self) -> dict[str, Any]:
+        """For another process: without what is open here."""
+        return self.__dict__ | {"_readers": collections.OrderedDict(), "_lock": None}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state)
+        self._lock = threading.Lock()
+
+    def close(self) -> None:
+        """Closes the files that are open; reading opens them again."""
+        with self._lock:
+            while self._readers:
+                self._readers.popitem()[1].close()
 
     def read(self, sequence: schema.Sequence, index: int) -> schema.RawFrame:
         """See schema.Recording."""
@@ -161,77 +194,20 @@ class PackedRecording:
                 (record,) = self._reader(shard).read([position])
         except (RuntimeError, IndexError, ValueError) as error:
             raise _damaged(where, str(error)) from error
-        return decode_frame(record, where, only)
+        frame = decode_frame(record, where, only)
+        for name in self._unwanted & frame.keys():
+            del frame[name]  # type: ignore[misc]
+        return frame
 
     def _reader(self, shard: int) -> Any:
         if shard not in self._readers:
+            while len(self._readers) >= _OPEN_READERS:
+                self._readers.popitem(last=False)[1].close()
             self._readers[shard] = array_record_module.ArrayRecordReader(
                 str(self._root / self._shards[shard]["file"]), _READER_OPTIONS,
                 file_reader_buffer_size=_READER_BUFFER_BYTES)
+        self._readers.move_to_end(shard)
         return self._readers[shard]
-
-
-def read_manifest(root: pathlib.Path) -> dict:
-    """The manifest of a packed recording.
-
-    Raises:
-      DataError: where it is missing, of another version or malformed.
-    """
-    path = root / MANIFEST_FILE
-    try:
-        manifest = json.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError as error:
-        raise files.missing(path, "the manifest of a packed recording (pack it to the end)") from error
-    except ValueError as error:
-        raise schema.DataError(f"{path}: not valid JSON ({error}). Pack the recording again.") from error
-    version = manifest.get("schema_version") if isinstance(manifest, dict) else None
-    if version != SCHEMA_VERSION:
-        raise schema.DataError(f"{path}: schema_version is {version!r}, this reader knows {SCHEMA_VERSION}. Pack the "
-                               f"recording again, or use the muvo_jax that wrote it.")
-    lacking = [name for name in ("shards", "frames_per_shard", "sequences", "description") if name not in manifest]
-    if lacking:
-        raise schema.DataError(f"{path}: {', '.join(lacking)} missing. Pack the recording again.")
-    return manifest
-
-
-def shard_fault(root: pathlib.Path, shard: dict, *, checksum: bool) -> str | None:
-    """What is wrong with a shard, given its entry in the manifest; None where nothing is."""
-    path = root / shard["file"]
-    if not path.is_file():
-        return "it is missing"
-    size = path.stat().st_size
-    if size != shard["bytes"]:
-        return f"it has {size} bytes, not {shard['bytes']}"
-    if checksum and file_sha256(path) != shard["sha256"]:
-        return "its checksum does not fit"
-    return None
-
-
-def file_sha256(path: pathlib.Path) -> str:
-    """Hexadecimal SHA-256 of a file, read in pieces."""
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
-
-
-def describe(description: schema.RecordingDescription) -> dict:
-    """The JSON form of a description, without its kind."""
-    values = dataclasses.asdict(description)
-    values["modalities"] = sorted(description.modalities)
-    return values
-
-
-def _description(manifest: dict, path: pathlib.Path) -> schema.RecordingDescription:
-    values = dict(manifest["description"])
-    try:
-        sections = {name: description_lib.section({name: values[name]} if values.get(name) else {}, name, path,
-                                                  required=False) for name in ("camera", "lidar", "voxels")}
-        contract = config_lib.parse(config_lib.ActionContract, values["contract"], f"{path}: contract")
-        return schema.RecordingDescription(
-            name=values["name"], kind=f"packed {values['kind']}", rate_hz=values["rate_hz"], contract=contract,
-            modalities=frozenset(values["modalities"]), splits=tuple(values["splits"]), notes=tuple(values["notes"]),
-            **sections)
-    except (KeyError, TypeError, ValueError) as error:
-        raise schema.DataError(f"{path}: description is malformed ({error}). Pack the recording again.") from error
 
 
 def _encode(name: str, array: np.ndarray, encoding: Encoding) -> tuple[str, bytes]:
@@ -251,16 +227,32 @@ def _encode(name: str, array: np.ndarray, encoding: Encoding) -> tuple[str, byte
 def _decode(content: bytes, encoding: str, dtype: np.dtype, shape: tuple[int, ...]) -> np.ndarray:
     if dtype.hasobject or encoding not in _ENCODINGS:
         raise ValueError(f"encoding {encoding!r} of {dtype} is unknown")
+    size = math.prod(shape)
+    if not all(manifest_lib.is_count(side) for side in shape) or size * dtype.itemsize > _LARGEST_ARRAY_BYTES:
+        raise ValueError(f"{dtype}{list(shape)} is larger than {_LARGEST_ARRAY_BYTES} bytes")
     if encoding in ("png", "jpeg"):
         with Image.open(io.BytesIO(content)) as image:
+            if (image.height, image.width) != shape[:2]:
+                raise ValueError(f"a picture of {image.width}x{image.height} pixels, expected {list(shape)}")
             array = np.asarray(image)
     elif encoding == "float16":
-        array = np.frombuffer(zlib.decompress(content), np.float16).astype(dtype).reshape(shape)
+        array = np.frombuffer(_inflated(content, 2 * size), np.float16).astype(dtype).reshape(shape)
+    elif encoding == "zlib":
+        array = np.frombuffer(_inflated(content, size * dtype.itemsize), dtype).reshape(shape)
     else:
-        array = np.frombuffer(content if encoding == "raw" else zlib.decompress(content), dtype).reshape(shape)
+        array = np.frombuffer(content, dtype).reshape(shape)
     if array.shape != shape or array.dtype != dtype:
         raise ValueError(f"found {array.dtype}{list(array.shape)}, expected {dtype}{list(shape)}")
     return array
+
+
+def _inflated(content: bytes, size: int) -> bytes:
+    """Exactly `size` bytes; nothing that claims to be more is unpacked."""
+    inflater = zlib.decompressobj()
+    inflated = inflater.decompress(content, size or 1)
+    if len(inflated) != size or inflater.decompress(inflater.unconsumed_tail, 1) or not inflater.eof:
+        raise ValueError(f"its compressed bytes are not the {size} that its shape takes")
+    return inflated
 
 
 def _damaged(where: str, why: str) -> schema.DataError:

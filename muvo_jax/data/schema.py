@@ -7,25 +7,26 @@ pipeline.py cuts windows. Ego frame and time convention: muvo_jax.types.
 from __future__ import annotations
 
 import dataclasses
-from typing import Protocol, TypedDict
+from collections.abc import Collection
+from typing import Annotated, Protocol, TypedDict
 
 import numpy as np
 
 from muvo_jax import config as config_lib
+from muvo_jax import geometry
+from muvo_jax.data.errors import DataError, DataWarning
+from muvo_jax.data.fields import LABELS
+from muvo_jax.limits import RangeError, between, check
 from muvo_jax.ops import camera as camera_ops
 
-# Keys of RawFrame that a reader fills only where `labels` names them: they cost time, and few models learn from them.
-LABELS = frozenset({"depth_m", "image_classes", "image_instance_mask", "point_classes", "birds_eye_classes",
-                    "birds_eye_instances"})
+__all__ = ["INSTANCE_CLASSES", "LABELS", "Camera", "DataError", "DataWarning", "RawFrame", "Recording",
+           "RecordingDescription", "Sequence", "in_every_frame", "instance_mask", "longest"]
+
+_SIDE_PX = between(1, 100_000, "px")
+_RIGID = 0.02  # calibrations are printed with a few digits
+_FOCAL_SIDES = between(0.01, 60)  # fields of view of 178 degrees to 1
+_CENTRE_SIDES = between(-2, 3)
 INSTANCE_CLASSES = ("vehicle", "pedestrian")  # what image_instance_mask shows, by the names of a recording's classes
-
-
-class DataError(ValueError):
-    """Recorded data that cannot be used; the message names the file, what was expected and how to go on."""
-
-
-class DataWarning(UserWarning):
-    """Recorded data that can be used in part; the message counts what is left out."""
 
 
 class RawFrame(TypedDict, total=False):
@@ -89,10 +90,43 @@ class Camera:
       camera_to_ego: 4x4 rows, metres.
     """
 
-    width_px: int
-    height_px: int
+    width_px: Annotated[int, _SIDE_PX]
+    height_px: Annotated[int, _SIDE_PX]
     intrinsics: tuple[tuple[float, ...], ...]
     camera_to_ego: tuple[tuple[float, ...], ...]
+
+    def __post_init__(self):
+        check(self)
+        self._check_intrinsics()
+        pose = self._matrix("camera_to_ego", 4)
+        turn = pose[:3, :3]
+        if np.abs(pose[3] - [0, 0, 0, 1]).max() > 0 or np.abs(turn @ turn.T - np.eye(3)).max() > _RIGID or (
+                np.linalg.det(turn) < 0):
+            raise RangeError("Camera", "camera_to_ego", f"is {self.camera_to_ego}; it must be a rotation and a place "
+                                                        f"(m) in the ego frame, with the last row 0, 0, 0, 1.")
+        if not all(geometry.MOUNTING_M.holds(value) for value in pose[:3, 3]):
+            raise RangeError("Camera", "camera_to_ego", f"puts the camera at {pose[:3, 3].tolist()}; each coordinate "
+                                                        f"must be {geometry.MOUNTING_M}.")
+
+    def _check_intrinsics(self):
+        matrix = self._matrix("intrinsics", 3)
+        if matrix[2].tolist() != [0, 0, 1] or matrix[1, 0] != 0:
+            raise RangeError("Camera", "intrinsics", f"are {self.intrinsics}; expected [[fx, skew, cx], [0, fy, cy], "
+                                                     f"[0, 0, 1]] in pixels.")
+        for name, value, side_px in (("fx", matrix[0, 0], self.width_px), ("fy", matrix[1, 1], self.height_px)):
+            if not _FOCAL_SIDES.holds(value / side_px):
+                raise RangeError("Camera", "intrinsics", f"have {name} = {value:g} for {side_px} pixels; a focal "
+                                                         f"length must be {_FOCAL_SIDES} times that, in pixels.")
+        for name, value, side_px in (("cx", matrix[0, 2], self.width_px), ("cy", matrix[1, 2], self.height_px)):
+            if not _CENTRE_SIDES.holds(value / side_px):
+                raise RangeError("Camera", "intrinsics", f"have {name} = {value:g} for {side_px} pixels; the middle "
+                                                         f"must be {_CENTRE_SIDES} times that, in pixels.")
+
+    def _matrix(self, name: str, size: int) -> np.ndarray:
+        rows = getattr(self, name)
+        if [len(row) for row in rows] != [size] * size:
+            raise RangeError("Camera", name, f": got {rows}, expected {size} rows of {size} numbers.")
+        return np.asarray(rows, np.float64)
 
     @classmethod
     def of(cls, width_px: int, height_px: int, intrinsics: np.ndarray, camera_to_ego: np.ndarray) -> Camera:
@@ -116,12 +150,22 @@ class Sequence:
       name: the run it comes from.
       start: index within the run of its first frame.
       length: number of frames.
+      lacks: keys of RawFrame that the recording has but these frames have not; a model that needs one of them passes
+        the sequence over.
     """
 
     split: str
     name: str
     start: int
     length: int
+    lacks: tuple[str, ...] = ()
+
+    def __post_init__(self):
+        object.__setattr__(self, "lacks", tuple(self.lacks))  # JSON has lists
+
+    def has(self, fields: Collection[str]) -> bool:
+        """Whether its frames have all of these fields, as far as the recording has them."""
+        return set(fields).isdisjoint(self.lacks)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -135,10 +179,11 @@ class RecordingDescription:
       lidar: field of view and mounting, with the sensor's own rows and columns; None without points.
       voxels: the grid of stored occupancy; None where none is stored.
       contract: what an action means.
-      modalities: the keys of RawFrame that every frame has.
+      modalities: the keys of RawFrame that frames have, but for what their sequence lacks.
       splits: in the order in which they should be reported.
       notes: sentences that whoever starts a run should read.
       classes: names of image_classes and point_classes, in order; empty where the recording has neither.
+      route_map: scale of its route maps; None without them.
     """
 
     name: str
@@ -152,6 +197,7 @@ class RecordingDescription:
     splits: tuple[str, ...]
     notes: tuple[str, ...] = ()
     classes: tuple[str, ...] = ()
+    route_map: config_lib.RouteMap | None = None
 
 
 class Recording(Protocol):
@@ -185,6 +231,12 @@ def instance_mask(classes: np.ndarray, names: tuple[str, ...]) -> np.ndarray:
     return np.isin(classes, [index for index, name in enumerate(names) if name in INSTANCE_CLASSES])
 
 
-def longest(sequences: tuple[Sequence, ...], split: str) -> int:
-    """Frames in the longest sequence of a split, 0 where it has none."""
-    return max((sequence.length for sequence in sequences if sequence.split == split), default=0)
+def longest(sequences: tuple[Sequence, ...], split: str, needed: Collection[str] = ()) -> int:
+    """Frames in the longest sequence of a split that has the needed fields, 0 where there is none."""
+    return max((sequence.length for sequence in sequences if sequence.split == split and sequence.has(needed)),
+               default=0)
+
+
+def in_every_frame(recording: Recording) -> frozenset[str]:
+    """The keys of RawFrame that no sequence lacks."""
+    return recording.description.modalities.difference(*(sequence.lacks for sequence in recording.sequences))

@@ -7,7 +7,7 @@ from collections.abc import Callable, Collection
 from typing import Any, NamedTuple
 
 from muvo_jax import config as config_lib
-from muvo_jax.data import carla, carla_runs, files, kitti, plain, prepare, records, schema
+from muvo_jax.data import carla, carla_runs, files, kitti, manifest, plain, prepare, records, schema
 from muvo_jax.data.town import record
 
 
@@ -20,6 +20,7 @@ class Kind(NamedTuple):
       matches: whether a folder is one.
       open: its reader.
       cameras: names that `open` takes as its `camera`; empty where a recording has one only.
+      options: of "camera", "labels" and "corrupt" those that `open` takes.
     """
 
     name: str
@@ -27,18 +28,23 @@ class Kind(NamedTuple):
     matches: Callable[[pathlib.Path], bool]
     open: Callable[..., schema.Recording]
     cameras: tuple[str, ...] = ()
+    options: tuple[str, ...] = ("labels",)
 
 
 KINDS = (
-    Kind("packed", f"a folder of shards with {records.MANIFEST_FILE}",
-         lambda path: (path / records.MANIFEST_FILE).is_file(), records.PackedRecording),
+    Kind("packed", f"a folder of shards with {manifest.MANIFEST_FILE}",
+         lambda path: (path / manifest.MANIFEST_FILE).is_file(), records.PackedRecording,
+         options=("labels", "corrupt")),
     Kind("plain", f"a folder with {plain.DESCRIPTION_FILE}",
          lambda path: (path / plain.DESCRIPTION_FILE).is_file(), plain.PlainRecording),
     Kind("KITTI raw", "<date>/<date>_drive_NNNN_sync folders, or one of them",
-         lambda path: bool(kitti.find_drives(path)), kitti.KittiRecording, kitti.CAMERAS),
+         lambda path: bool(kitti.find_drives(path)), kitti.KittiRecording, kitti.CAMERAS, options=("camera",)),
     Kind("MUVO CARLA", f"trainval/<mode>/<Town>/<run> folders with {carla_runs.FRAME_FILE}, or one of them",
          lambda path: bool(carla_runs.folders(path)), carla.CarlaRecording),
 )
+
+
+_ARCHIVES = (".zip", ".tar", ".tgz", ".gz", ".xz", ".bz2", ".zst", ".7z", ".rar")
 
 
 def recognise(path: pathlib.Path | str, *, camera: str = "") -> Kind:
@@ -50,9 +56,15 @@ def recognise(path: pathlib.Path | str, *, camera: str = "") -> Kind:
     """
     path = pathlib.Path(path).expanduser()
     known = "; ".join(f"{kind.name} ({kind.layout})" for kind in KINDS)
+    if str(path) == "town" and not path.exists():
+        raise schema.DataError("\"town\" names the built-in world, which python -m muvo_jax.train --data=town records "
+                               "first; here give the folder of a recording, such as that in ~/.cache/muvo_jax.")
     if not path.exists():
         raise schema.DataError(f"data folder {path} does not exist. Expected a recording: {known}; or \"town\", the "
                                f"built-in world.")
+    if path.is_file() and path.name.lower().endswith(_ARCHIVES):
+        raise schema.DataError(f"{path} is an archive: unpack it and give the folder that comes out. Expected a "
+                               f"recording: {known}.")
     if not path.is_dir():
         raise schema.DataError(f"{path} is a file; expected the folder of a recording: {known}.")
     if not any(path.iterdir()):
@@ -82,12 +94,9 @@ def open_recording(path: pathlib.Path | str, *, camera: str = "", skip_corrupt_s
     """
     path = pathlib.Path(path).expanduser()
     kind = recognise(path, camera=camera)
-    if kind.open is records.PackedRecording and skip_corrupt_shards:
-        return records.PackedRecording(path, corrupt="skip")
-    options: dict[str, Any] = {"camera": camera} if camera else {}
-    if kind.open in (plain.PlainRecording, carla.CarlaRecording):
-        options["labels"] = frozenset(labels)
-    return kind.open(path, **options)
+    given: dict[str, Any] = {"labels": frozenset(labels), "corrupt": "skip" if skip_corrupt_shards else "raise"}
+    given |= {"camera": camera} if camera else {}
+    return kind.open(path, **{name: value for name, value in given.items() if name in kind.options})
 
 
 def open_configured(config: config_lib.Config, progress: record.Progress | None = None) -> schema.Recording:

@@ -17,11 +17,10 @@ import dataclasses
 import io
 import json
 import math
-import os
 import pathlib
 import shutil
 import zipfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -47,7 +46,7 @@ RULES = ("carved", "reference")
 RULE_FILE = "rule.json"
 ORIGINAL_FRAME_FILE = "pd_dataframe.before_voxels.pkl"
 _LOCK_FILE = ".voxelizing"
-_CHUNK = 4  # frames between two reports of progress
+_CHUNK = 4  # frames that a process makes at a time
 _LEVEL = ((0, 0, 1), (-1, 0, 0), (0, -1, 0))
 
 
@@ -108,14 +107,17 @@ def voxelize(path: pathlib.Path | str, *, rule: str = "carved", overwrite: bool 
             folder.mkdir(exist_ok=True)
             recorder.write_atomically(folder / RULE_FILE, rule_text)
         kept = len(frames) - len(missing)
-        workers = min(workers or os.cpu_count() or 1, math.ceil(len(missing) / _CHUNK))
-        shares = [(rig, missing[first::workers]) for first in range(workers)]
-        made = processes.stream(make_frames, shares, "voxelizing") if workers > 1 else make_frames(rig, missing)
+        chunks = [missing[first:first + _CHUNK] for first in range(0, len(missing), _CHUNK)]
+        workers = min(workers or processes.processors(), len(chunks))
+        made = (processes.spread(make_frames, chunks, shared=(rig,), workers=workers, doing="voxelizing")
+                if workers > 1 else (make_frames(rig, chunk) for chunk in chunks))
         faults: list[str] = []
-        for done, fault in enumerate(made, start=1):
-            faults += [fault] if fault else []
-            if progress is not None and (done % _CHUNK == 0 or done == len(missing)):
-                progress(kept + done, len(frames))
+        done = kept
+        for outcomes in made:
+            faults += filter(None, outcomes)
+            done += len(outcomes)
+            if progress is not None:
+                progress(done, len(frames))
         if rig.is_muvo and rule == "reference":
             for folder, run in runs.items():
                 if all(frame.target.is_file() for frame in run):
@@ -126,15 +128,17 @@ def voxelize(path: pathlib.Path | str, *, rule: str = "carved", overwrite: bool 
     return Result(made=len(missing), kept=kept)
 
 
-def make_frames(rig: Rig, frames: list[Frame]) -> Iterator[str]:
-    """Makes frames; yields after each what was wrong with it, or an empty string."""
+def make_frames(rig: Rig, frames: list[Frame]) -> list[str]:
+    """Makes frames; what was wrong with each, or an empty string."""
+    outcomes = []
     for frame in frames:
         try:
             recorder.write_atomically(frame.target, _content(rig, frame))
         except schema.DataError as error:
-            yield str(error)
+            outcomes.append(str(error))
         else:
-            yield ""
+            outcomes.append("")
+    return outcomes
 
 
 def is_whole(path: pathlib.Path) -> bool:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import collections
 import dataclasses
 import threading
-from collections.abc import Callable, Hashable
+from collections.abc import Callable, Collection, Hashable
 
 import numpy as np
 
@@ -27,8 +27,9 @@ class Window:
         return range(self.start, self.start + prepare.span(self.frames, self.stride), self.stride)
 
 
-def find_windows(recording: schema.Recording, split: str, *, frames: int, stride: int) -> tuple[Window, ...]:
-    """All windows of a split that fit into a sequence, in recorded order.
+def find_windows(recording: schema.Recording, split: str, *, frames: int, stride: int,
+                 needs: Collection[str] = ()) -> tuple[Window, ...]:
+    """All windows of a split that fit into a sequence whose frames have what is needed, in recorded order.
 
     Raises:
       DataError: for an unknown split, or where every sequence is shorter than the window (naming both lengths).
@@ -36,10 +37,11 @@ def find_windows(recording: schema.Recording, split: str, *, frames: int, stride
     if split not in recording.description.splits:
         raise schema.DataError(f"recording {recording.description.name!r} has no split {split!r}; it has "
                                f"{', '.join(recording.description.splits)}.")
-    found = tuple(Window(sequence, start, frames, stride) for sequence in recording.sequences if sequence.split == split
+    found = tuple(Window(sequence, start, frames, stride) for sequence in recording.sequences
+                  if sequence.split == split and sequence.has(needs)
                   for start in range(sequence.length - prepare.span(frames, stride) + 1))
     if not found:
-        raise prepare.too_short(recording, split, frames, stride)
+        raise prepare.too_short(recording, split, frames, stride, needs)
     return found
 
 

@@ -67,7 +67,7 @@ def read(path: str | os.PathLike) -> Stored:
       TorchFileError, SafetensorsError: for a file that cannot be read.
       CheckpointMismatch: where it holds no tensors by name.
     """
-    path = pathlib.Path(path)
+    path = pathlib.Path(path).expanduser()
     loaded = safetensors_file.load(path) if path.suffix == ".safetensors" else torch_file.load(path)
     outer = loaded if isinstance(loaded, dict) else {}
     tensors = outer.get("state_dict", outer)

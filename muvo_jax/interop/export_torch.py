@@ -7,12 +7,15 @@ import pathlib
 import sys
 from typing import Annotated
 
-import jax
 import numpy as np
 import tyro
 
-from muvo_jax import command_line
-from muvo_jax.interop import names, safetensors_file
+from muvo_jax import command_line, late
+
+with late.imports():
+    import jax
+
+    from muvo_jax.interop import names, safetensors_file
 
 
 @dataclasses.dataclass(frozen=True)

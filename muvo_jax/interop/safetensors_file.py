@@ -1,7 +1,7 @@
 """Reads and writes safetensors files: 8 bytes for the length of a header, the header in JSON, then little-endian data.
 
-Written here rather than taken from the safetensors package: the format is these forty lines, the package would be one
-more dependency, and its NumPy interface copies each tensor where a memory map is enough.
+Written here rather than taken from the safetensors package: its NumPy interface knows no bfloat16 (0.8.0 raises
+KeyError: 'BF16'), which checkpoints are stored in, and copies each tensor where a memory map is enough.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ def load(path: str | os.PathLike) -> dict[str, np.ndarray]:
     Raises:
       SafetensorsError: where the file is missing, damaged or no safetensors file.
     """
-    path = pathlib.Path(path)
+    path = pathlib.Path(path).expanduser()
     try:
         mapped = np.memmap(path, np.uint8, mode="r")
         (size,) = struct.unpack("<Q", mapped[:8].tobytes())
@@ -72,7 +72,7 @@ def save(path: str | os.PathLike, tensors: Mapping[str, np.ndarray], metadata: M
     Raises:
       ValueError: for a dtype that the format lacks.
     """
-    path = pathlib.Path(path)
+    path = pathlib.Path(path).expanduser()
     header: dict[str, dict] = {"__metadata__": dict(metadata)} if metadata else {}
     position = 0
     for name, tensor in tensors.items():

@@ -187,7 +187,7 @@ def load(path: str | os.PathLike) -> Any:
     Raises:
       TorchFileError: where the file is missing, damaged, no file of torch.save, or asks for foreign code.
     """
-    path = pathlib.Path(path)
+    path = pathlib.Path(path).expanduser()
     try:
         with path.open("rb") as file:
             head = file.read(4)

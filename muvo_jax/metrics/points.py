@@ -57,11 +57,14 @@ def frame_chamfer_m(prediction: types.ArrayLike, truth: types.ArrayLike, *, retu
       above_m: only points higher than this count, of either side.
 
     Returns:
-      float64 [B, H], NaN where one side of a frame is empty.
+      float64 [B, H], NaN where one side of a frame is empty, or the prediction is not finite.
     """
     prediction, truth = np.asarray(prediction), np.asarray(truth)
     distances = np.empty(prediction.shape[:2])
     for window, step in np.ndindex(distances.shape):
+        if not np.isfinite(prediction[window, step]).all():
+            distances[window, step] = np.nan
+            continue
         clouds = (range_view_points(prediction[window, step], return_threshold_m, above_m),
                   range_view_points(truth[window, step], 0.0, above_m))
         distances[window, step] = chamfer_m(*(keyed_subset(cloud, points, (*seed, window, step, side))

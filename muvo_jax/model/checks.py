@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import numbers
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from muvo_jax.model.world_model import WorldModel
-from muvo_jax.types import LatentState
+from muvo_jax.model.world_model import WorldModel, inputs
+from muvo_jax.ops import conv
+from muvo_jax.types import Batch, LatentState
 
 ACTION_CHANNELS = 2
 _ROUNDING = 1e-6
@@ -91,6 +94,47 @@ def action_values(given, where: str) -> None:
                          f"expected [-1, 1] (acceleration, steering; see muvo_jax.config.ActionContract).")
 
 
+def finite(where: str, **named) -> None:
+    """Raises ValueError where a concrete array holds NaN or infinity, naming it; traced values and integers pass."""
+    for name, tree in named.items():
+        for leaf in jax.tree.leaves(tree):
+            if isinstance(leaf, jax.core.Tracer) or not jnp.issubdtype(jnp.result_type(leaf), jnp.floating):
+                continue
+            wrong = int((~np.isfinite(np.asarray(leaf))).sum())  # NumPy, lest a trace around the call sees it
+            if wrong:
+                raise ValueError(f"{where}: {name} {list(jnp.shape(leaf))} holds {wrong} values that are not finite.")
+
+
+def finite_on_host(where: str, **named) -> None:
+    """As `finite`, but arrays on a device pass: in a step of a loop the host would wait to look at them."""
+    finite(where, **{name: [leaf for leaf in jax.tree.leaves(tree) if not isinstance(leaf, jax.Array)]
+                     for name, tree in named.items()})
+
+
+def observation(where: str, model: WorldModel, batch: Batch) -> None:
+    """Raises ValueError where an input of the model, or an action, is concrete and not finite."""
+    read = {"action": batch.action, "range_view": batch.range_view}
+    read |= {name: getattr(batch, name) for name in inputs(model.config)}
+    finite(where, **{name: value for name, value in read.items() if value is not None})
+
+
+def forward_mode(where: str, model: WorldModel, *trees) -> None:
+    """Raises TypeError where jvp, jacfwd or hessian differentiate through convolutions that know reverse mode alone.
+
+    Only what is differentiated directly can be seen: under jit, JAX says it in its own words.
+    """
+    if not conv.reverse_only(model.config.convolution):
+        return
+    for leaf in jax.tree.leaves(trees):
+        while isinstance(leaf, jax.core.Tracer):
+            if type(leaf).__name__ == "JVPTracer":
+                raise TypeError(f"{where}: forward-mode derivatives (jvp, jacfwd, hessian) do not pass the "
+                                f"convolutions' fast forms; jax.grad does. Take a model with convolution \"xla\", "
+                                f"which reads the same variables: WorldModel(dataclasses.replace(model.config, "
+                                f"convolution=\"xla\")).")
+            leaf = getattr(leaf, "primal", getattr(leaf, "val", None))
+
+
 def counts(horizon: int | None, branches: int | None) -> int:
     """Returns the horizon.
 
@@ -99,6 +143,9 @@ def counts(horizon: int | None, branches: int | None) -> int:
     """
     if horizon is None:
         raise ValueError("imagine: a policy needs a horizon; pass horizon=number of steps.")
+    for name, count in (("horizon", horizon), ("branches", branches)):
+        if count is not None and (isinstance(count, bool) or not isinstance(count, numbers.Integral)):
+            raise ValueError(f"imagine: {name} is {count!r}; expected a whole number.")
     if horizon < 1:
         raise ValueError(f"imagine: horizon is {horizon}; it must be at least 1.")
     if branches is not None and branches < 1:

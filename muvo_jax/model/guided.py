@@ -8,6 +8,7 @@ and learns the rest: to fill what was hidden, to move what moves, to blur what i
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
@@ -106,12 +107,12 @@ class GuidedHead(linen.Module):
         return compose(raw, glimpse, mean, config)
 
 
-def _see_image(glimpse: memory.Glimpse, config: ModelConfig) -> jax.Array:
+def _see_image(glimpse: memory.ImageGlimpse, config: ModelConfig) -> jax.Array:
     del config
     return jnp.concatenate([glimpse.image - 0.5 * glimpse.covered, glimpse.covered], axis=-1)
 
 
-def _compose_image(raw, glimpse: memory.Glimpse, mean, config: ModelConfig) -> dict[int, jax.Array]:
+def _compose_image(raw, glimpse: memory.ImageGlimpse, mean, config: ModelConfig) -> dict[int, jax.Array]:
     del config
     drawn, average = raw, mean(jax.tree.map(jnp.zeros_like, raw))
     moved, covered, result = glimpse.image, glimpse.covered, {}
@@ -126,7 +127,7 @@ def _nearness(range_m: jax.Array) -> jax.Array:
     return jnp.where(range_m > 0.0, _NEAR_M / (_NEAR_M + jnp.maximum(range_m, 0.0)), 0.0)
 
 
-def _see_ranges(glimpse: memory.Glimpse, config: ModelConfig) -> jax.Array:
+def _see_ranges(glimpse: memory.RangeGlimpse, config: ModelConfig) -> jax.Array:
     scale_m = config.range_scale_m
     given = [glimpse.filled_m, glimpse.newest_m, glimpse.still_m]
     channels = [*map(_nearness, given), *(jnp.maximum(value, 0.0) / scale_m for value in (given[0], given[2])),
@@ -135,7 +136,7 @@ def _see_ranges(glimpse: memory.Glimpse, config: ModelConfig) -> jax.Array:
     return jnp.stack(channels, axis=-1)
 
 
-def _compose_ranges(raw, glimpse: memory.Glimpse, mean, config: ModelConfig) -> dict[int, jax.Array]:
+def _compose_ranges(raw, glimpse: memory.RangeGlimpse, mean, config: ModelConfig) -> dict[int, jax.Array]:
     """x, y, z and range in units of range_scale_m; the range is -1 m where nothing is expected to return."""
     average = mean({scale: jnp.zeros_like(value[..., :4]) for scale, value in raw.items()})
     nothing, result = RANGE_NO_RETURN_M / config.range_scale_m, {}
@@ -159,14 +160,14 @@ def _compose_ranges(raw, glimpse: memory.Glimpse, mean, config: ModelConfig) -> 
     return result
 
 
-def _see_voxels(glimpse: memory.Glimpse, config: ModelConfig) -> jax.Array:
+def _see_voxels(glimpse: memory.VoxelGlimpse, config: ModelConfig) -> jax.Array:
     del config
     return jnp.concatenate([glimpse.newest, glimpse.older], axis=-1)
 
 
-def _compose_voxels(raw, glimpse: memory.Glimpse, mean, config: ModelConfig) -> dict[int, jax.Array]:
+def _compose_voxels(raw, glimpse: memory.VoxelGlimpse, mean, config: ModelConfig) -> dict[int, jax.Array]:
     grid = config.voxels
-    heights = grid.origin_m[2] + grid.voxel_size_m * jnp.arange(grid.shape[2])
+    heights = grid.origin_m[2] + grid.voxel_size_m * jnp.arange(grid.shape[2], dtype=jnp.float32)
     trust = jnp.where(heights >= _OVER_ROAD_M - 1e-3, _TRUST, 0.0).reshape(1, 1, 1, -1)
     # The newest scan has the say; the older ones where it has none. (Added up, what moves is cancelled out.)
     believed = trust * (glimpse.newest + (1.0 - jnp.abs(glimpse.newest)) * glimpse.older)
@@ -179,5 +180,6 @@ def _compose_voxels(raw, glimpse: memory.Glimpse, mean, config: ModelConfig) -> 
     return result
 
 
-_PARTS = {"image": (_see_image, _compose_image), "range_view": (_see_ranges, _compose_ranges),
-          "occupancy": (_see_voxels, _compose_voxels)}
+_PARTS: dict[str, tuple[Callable, Callable]] = {
+    "image": (_see_image, _compose_image), "range_view": (_see_ranges, _compose_ranges),
+    "occupancy": (_see_voxels, _compose_voxels)}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 from collections.abc import Mapping
 
@@ -11,7 +12,7 @@ import jax.numpy as jnp
 
 from muvo_jax.model import checks, rollout
 from muvo_jax.model import memory as memory_lib
-from muvo_jax.model.world_model import WorldModel
+from muvo_jax.model.world_model import WorldModel, inputs
 from muvo_jax.types import UNTIMED_FIELDS, Array, ArrayLike, Batch, LatentState, Memory, Motion, Variables
 
 
@@ -64,7 +65,9 @@ def observe_step(model: WorldModel, variables: Variables, live: LiveState, obser
       LiveState; imagine from its `latent`.
 
     Raises:
-      ValueError: if shapes or dtypes do not fit the model, or an action is out of range.
+      ValueError: if shapes or dtypes do not fit the model, an action is out of range, or an input on the host not
+        finite.
+      TypeError: for forward-mode derivatives through convolutions that have none (ModelConfig.convolution).
     """
     batch_size = live.frame.shape[0]
     action = checks.one_action(previous_action, (batch_size,), "observe_step", "previous_action")
@@ -72,7 +75,11 @@ def observe_step(model: WorldModel, variables: Variables, live: LiveState, obser
     fields = {name: jnp.asarray(value) if name in UNTIMED_FIELDS else jnp.expand_dims(jnp.asarray(value), 1)
               for name, value in observation.items()}
     batch = Batch(action=jnp.expand_dims(action, 1), is_first=jnp.expand_dims(live.frame == 0, 1), **fields)
-    return _observe_step(model, variables, live, batch.validate(), sampled)
+    batch.validate()
+    checks.finite_on_host("observe_step", state=live.latent, **{
+        name: value for name, value in observation.items() if name in {*inputs(model.config), "range_view"}})
+    checks.forward_mode("observe_step", model, variables, live.latent, batch)
+    return _observe_step(model, variables, live, batch, sampled)
 
 
 @functools.partial(jax.jit, static_argnames=("model", "sampled"))
@@ -90,9 +97,10 @@ def _observe_step(model, variables, live, batch, sampled):
     before = live.latent.vantage
     step, speed_mps = _measured(model, variables, batch, before, latent)
     still = Motion(jnp.zeros_like(before.motion.pose), speed_mps)
-    vantage = before.replace(motion=still, first=jnp.maximum(before.first - 1, 0), steps=jnp.zeros_like(before.steps))
+    vantage = dataclasses.replace(before, motion=still, first=jnp.maximum(before.first - 1, 0),
+                                  steps=jnp.zeros_like(before.steps))
     remembered = None if live.memory is None else memory_lib.remember(live.memory, batch, step)
-    return LiveState(latent.replace(vantage=vantage), live.keys, live.frame + 1, remembered)
+    return LiveState(dataclasses.replace(latent, vantage=vantage), live.keys, live.frame + 1, remembered)
 
 
 def _measured(model, variables, batch, before, latent):

@@ -9,11 +9,14 @@ nothing. docs/memory.md says what this brings and what it cannot do.
 
 from __future__ import annotations
 
+import dataclasses
+
 import flax.struct
 import jax
 import jax.numpy as jnp
 
 from muvo_jax.config import NO_SENSOR, ModelConfig
+from muvo_jax.geometry import VoxelGrid
 from muvo_jax.ops import motion as motion_ops
 from muvo_jax.ops import reproject
 from muvo_jax.types import RANGE_NO_RETURN_M, UNTIMED_FIELDS, Array, Batch, LatentState, Memory, Motion, Vantage
@@ -22,29 +25,50 @@ FADE = 0.8  # weight of evidence that is one observation older: what moved away 
 
 
 @flax.struct.dataclass
-class Glimpse:
-    """The memory of one head from n vantages, at full size.
+class ImageGlimpse:
+    """The memory of the head image from n vantages, at full size.
 
     Attributes:
       image: float32 [n, H, W, 3] in [0, 1], the newest image moved, and `covered` [n, H, W, 1], 1 where it was seen.
+    """
+
+    image: Array
+    covered: Array
+
+
+@flax.struct.dataclass
+class RangeGlimpse:
+    """The memory of the head range_view from n vantages, at full size.
+
+    Attributes:
       moved_m, newest_m, still_m: float32 [n, Hr, Wr] ranges, -1 where nothing is: all scans moved, the newest moved,
         and the newest as it was.
       filled_m: float32 [n, Hr, Wr], moved_m with its small holes filled.
       sky: float32 [n, Hr, Wr], 1 where a pixel without a return came to lie.
       height_m: float32 [n, Hr, Wr], of the moved returns over the road.
+    """
+
+    moved_m: Array
+    newest_m: Array
+    still_m: Array
+    filled_m: Array
+    sky: Array
+    height_m: Array
+
+
+@flax.struct.dataclass
+class VoxelGlimpse:
+    """The memory of the head occupancy from n vantages, at full size.
+
+    Attributes:
       newest, older: float32 [n, X, Y, Z] in [-1, 1], evidence of the newest scan and of all before it.
     """
 
-    image: Array | None = None
-    covered: Array | None = None
-    moved_m: Array | None = None
-    newest_m: Array | None = None
-    still_m: Array | None = None
-    filled_m: Array | None = None
-    sky: Array | None = None
-    height_m: Array | None = None
-    newest: Array | None = None
-    older: Array | None = None
+    newest: Array
+    older: Array
+
+
+Glimpse = ImageGlimpse | RangeGlimpse | VoxelGlimpse
 
 
 def guessed_heads(config: ModelConfig) -> tuple[str, ...]:
@@ -69,13 +93,14 @@ def inputs(config: ModelConfig) -> dict[str, tuple[int, ...]]:
 def initial_vantage(config: ModelConfig, batch_size: int) -> Vantage:
     """Before anything was seen: no observation is remembered."""
     zeros = jnp.zeros((batch_size,), jnp.int32)
-    return Vantage(Motion(jnp.zeros((batch_size, 3)), jnp.zeros((batch_size,))), zeros + config.memory_frames + 1,
-                   zeros + config.memory_frames, zeros)
+    standing = Motion(jnp.zeros((batch_size, 3), jnp.float32), jnp.zeros((batch_size,), jnp.float32))
+    return Vantage(standing, zeros + config.memory_frames + 1, zeros + config.memory_frames, zeros)
 
 
 def intended(config: ModelConfig, vantage: Vantage, action: Array) -> Motion:
     """What an action [..., 2] does to the car in one step of the model, in the ego frame before it."""
     kinematics = config.kinematics
+    assert kinematics is not None  # callers ask where the car moves as the head ego_motion says
     standing = motion_ops.at_rest_of_frame(vantage.motion.speed_mps)
     return motion_ops.drive(standing, action, kinematics.contract, kinematics.periods)
 
@@ -83,7 +108,7 @@ def intended(config: ModelConfig, vantage: Vantage, action: Array) -> Motion:
 def moved_on(vantage: Vantage, step: Motion) -> Vantage:
     """After one imagined step, given in the ego frame before it."""
     motion = motion_ops.moved(vantage.motion, jnp.concatenate([step.pose, jnp.expand_dims(step.speed_mps, -1)], -1))
-    return vantage.replace(motion=motion, steps=vantage.steps + 1)
+    return dataclasses.replace(vantage, motion=motion, steps=vantage.steps + 1)
 
 
 def measured(config: ModelConfig, batch: Batch) -> Motion | None:
@@ -121,7 +146,8 @@ def of_window(config: ModelConfig, batch: Batch, states: LatentState,
     poses = motion_ops.relative(poses, jnp.broadcast_to(poses[:, -1:], poses.shape))
     index = jnp.broadcast_to(jnp.arange(frames, dtype=jnp.int32)[None], is_first.shape)
     first = jax.lax.cummax(jnp.where(is_first, index, 0), axis=1)
-    states = states.replace(vantage=Vantage(Motion(poses, speed_mps), first, index, jnp.zeros_like(index)))
+    vantage = Vantage(Motion(poses, speed_mps), first, index, jnp.zeros_like(index))
+    states = dataclasses.replace(states, vantage=vantage)
     return states, _remembered(config, batch, poses)
 
 
@@ -143,11 +169,13 @@ def empty(config: ModelConfig, batch_size: int) -> Memory | None:
     if not heads:
         return None
     lead, view = (batch_size, config.memory_frames + 1), config.range_view
-    memory = Memory(jnp.zeros((*lead, 3)), jnp.full((*lead, view.rows, view.columns, 4), -1.0))
+    memory = Memory(jnp.zeros((*lead, 3), jnp.float32),
+                    jnp.full((*lead, view.rows, view.columns, 4), -1.0, jnp.float32))
     if "image" not in heads:
         return memory
-    return memory.replace(image=jnp.zeros((*lead, *config.image_size, 3), jnp.uint8),
-                          intrinsics=jnp.zeros((batch_size, 3, 3)), camera_to_ego=jnp.zeros((batch_size, 4, 4)))
+    return dataclasses.replace(memory, image=jnp.zeros((*lead, *config.image_size, 3), jnp.uint8),
+                               intrinsics=jnp.zeros((batch_size, 3, 3), jnp.float32),
+                               camera_to_ego=jnp.zeros((batch_size, 4, 4), jnp.float32))
 
 
 def remember(memory: Memory, batch: Batch, step: Array) -> Memory:
@@ -157,12 +185,13 @@ def remember(memory: Memory, batch: Batch, step: Array) -> Memory:
     """
     append = lambda old, new: jnp.concatenate([old[:, 1:], jnp.asarray(new).astype(old.dtype)], axis=1)
     poses = motion_ops.relative(memory.pose, jnp.broadcast_to(step[:, None], memory.pose.shape))
-    memory = memory.replace(pose=append(poses, jnp.zeros_like(step)[:, None]),
-                            range_view=append(memory.range_view, batch.range_view))
+    memory = dataclasses.replace(memory, pose=append(poses, jnp.zeros_like(step)[:, None]),
+                                 range_view=append(memory.range_view, batch.range_view))
     if memory.image is None:
         return memory
-    return memory.replace(image=append(memory.image, batch.image), intrinsics=jnp.asarray(batch.intrinsics),
-                          camera_to_ego=jnp.asarray(batch.camera_to_ego))
+    return dataclasses.replace(
+        memory, image=append(memory.image, batch.image), intrinsics=jnp.asarray(batch.intrinsics),
+        camera_to_ego=jnp.asarray(batch.camera_to_ego))
 
 
 def check(config: ModelConfig, states: LatentState | Array, memory: Memory | None, rows: Array | None,
@@ -223,7 +252,7 @@ def look(config: ModelConfig, memory: Memory, rows: Array, vantage: Vantage,
     index = jnp.clip(index, 0, memory.pose.shape[1] - 1)
     pose = motion_ops.relative(jnp.broadcast_to(vantage.motion.pose[:, None], (*index.shape, 3)),
                                memory.pose[rows[:, None], index])
-    glimpses = {}
+    glimpses: dict[str, Glimpse] = {}
     if "occupancy" in heads:
         glimpses["occupancy"] = _evidence(config, memory, rows, index, known, pose)
     if "range_view" in heads or "image" in heads:
@@ -235,7 +264,7 @@ def look(config: ModelConfig, memory: Memory, rows: Array, vantage: Vantage,
     return {head: glimpses[head] for head in heads}, jnp.concatenate(numbers, axis=-1)
 
 
-def _ranges(config: ModelConfig, memory: Memory, rows: Array, index: Array, known: Array, pose: Array) -> Glimpse:
+def _ranges(config: ModelConfig, memory: Memory, rows: Array, index: Array, known: Array, pose: Array) -> RangeGlimpse:
     geometry = config.range_view
     scans = memory.range_view[rows[:, None], index]
     scans = scans.reshape(*index.shape, -1, 4)
@@ -252,26 +281,67 @@ def _ranges(config: ModelConfig, memory: Memory, rows: Array, index: Array, know
     filled_m = reproject.fill_holes(moved[..., 3], sky, geometry)
     still_m = jnp.where(fresh, still[..., 3], RANGE_NO_RETURN_M)
     height_m = jnp.where(moved[..., 3] > 0.0, moved[..., 2], 0.0)
-    return Glimpse(moved_m=moved[..., 3], newest_m=newest[..., 3], filled_m=filled_m, still_m=still_m,
-                   sky=sky.astype(jnp.float32), height_m=height_m)
+    return RangeGlimpse(moved_m=moved[..., 3], newest_m=newest[..., 3], filled_m=filled_m, still_m=still_m,
+                        sky=sky.astype(jnp.float32), height_m=height_m)
 
 
 def _image(config: ModelConfig, memory: Memory, rows: Array, index: Array, known: Array, pose: Array,
-           view: Glimpse) -> Glimpse:
-    image = memory.image[rows, index].astype(jnp.float32) / 255.0
-    moved, inside = reproject.move_image(image, view.filled_m, pose, memory.intrinsics[rows],
-                                         memory.camera_to_ego[rows], config.range_view)
+           view: RangeGlimpse) -> ImageGlimpse:
+    assert memory.image is not None and memory.intrinsics is not None and memory.camera_to_ego is not None  # see check
+    images = memory.image.reshape(-1, *memory.image.shape[2:])
+    moved, inside = reproject.move_image(images, view.filled_m, pose, memory.intrinsics[rows],
+                                         memory.camera_to_ego[rows], config.range_view,
+                                         rows * memory.image.shape[1] + index)
     covered = jnp.expand_dims((inside & known.reshape(-1, 1, 1)).astype(jnp.float32), -1)
-    return Glimpse(image=moved * covered, covered=covered)
+    return ImageGlimpse(image=moved / 255.0 * covered, covered=covered)
 
 
-def _evidence(config: ModelConfig, memory: Memory, rows: Array, index: Array, known: Array, pose: Array) -> Glimpse:
-    frames, places = memory.pose.shape[1], index.shape[1]
-    which = (rows[:, None] * frames + index).reshape(-1)
-    scans_m = memory.range_view[..., 3].reshape(-1, config.range_view.rows, config.range_view.columns)
-    evidence = reproject.scan_evidence(scans_m, which, pose.reshape(-1, 3), config.voxels, config.range_view)
-    evidence = evidence.reshape(len(rows), places, *config.voxels.shape)
+def _evidence(config: ModelConfig, memory: Memory, rows: Array, index: Array, known: Array,
+              pose: Array) -> VoxelGlimpse:
+    if memory.evidence is not None:
+        both = reproject.move_voxels(memory.evidence, pose[:, -1], config.voxels, _wide(config.voxels), rows)
+        return VoxelGlimpse(*jnp.split(both, 2, axis=-1))
+    return VoxelGlimpse(*_scans_evidence(config, memory, rows, index, known, pose, config.voxels))
+
+
+def _scans_evidence(config: ModelConfig, memory: Memory, rows: Array, index: Array, known: Array, pose: Array,
+                    grid: VoxelGrid) -> tuple[Array, Array]:
+    """Evidence of the newest scan and of all before it, [n, X, Y, Z] each in [-1, 1].
+
+    A voxel that holds a return is occupied, as in the labels; the beam through its centre says the rest.
+    """
+    frames, places, view = memory.pose.shape[1], index.shape[1], config.range_view
+    flat_pose = pose.reshape(-1, 3)
+    scans_m = memory.range_view[..., 3].reshape(-1, view.rows, view.columns)
+    evidence = reproject.scan_evidence(scans_m, (rows[:, None] * frames + index).reshape(-1), flat_pose, grid, view)
+    scans = memory.range_view[rows[:, None], index].reshape(len(flat_pose), -1, 4)
+    hits = reproject.hit_voxels(motion_ops.into_frame(scans[..., :3], flat_pose), scans[..., 3] > 0.0, grid)
+    evidence = jnp.where(hits > 0.0, 1.0, evidence).reshape(len(rows), places, *grid.shape)
     evidence = jnp.where(known.reshape(*known.shape, 1, 1, 1), evidence, 0.0)
     weights = FADE ** jnp.arange(places - 2, -1, -1, dtype=jnp.float32).reshape(1, -1, 1, 1, 1)
-    older = (evidence[:, :-1] * weights).sum(axis=1)
-    return Glimpse(newest=evidence[:, -1], older=jnp.clip(older, -1.0, 1.0))
+    return evidence[:, -1], jnp.clip((evidence[:, :-1] * weights).sum(axis=1), -1.0, 1.0)
+
+
+def with_evidence(config: ModelConfig, memory: Memory | None, vantage: Vantage | None) -> Memory | None:
+    """The memory with the evidence for voxels worked out once, for many states that are imagined from its newest
+    observation: a planner's. Resampled from there it is a little blurred, and ends half a grid beyond the grid.
+
+    vantage: [B], of the states from which imagination starts; None where there is no memory.
+    """
+    if memory is None or vantage is None or "occupancy" not in config.heads:
+        return memory
+    places, rows = config.memory_frames, jnp.arange(memory.pose.shape[0])
+    index = jnp.broadcast_to(memory.pose.shape[1] + jnp.arange(-places, 0, dtype=jnp.int32)[None], (len(rows), places))
+    known = (index >= vantage.first[:, None]) & (index >= 0)
+    index = jnp.maximum(index, 0)
+    pose = motion_ops.relative(jnp.zeros((*index.shape, 3)), memory.pose[rows[:, None], index])
+    evidence = _scans_evidence(config, memory, rows, index, known, pose, _wide(config.voxels))
+    return dataclasses.replace(memory, evidence=jnp.concatenate(evidence, axis=-1))
+
+
+def _wide(grid: VoxelGrid) -> VoxelGrid:
+    """The grid with half its length more on each side."""
+    x, y, z = grid.shape
+    low_x, low_y, low_z = grid.origin_m
+    return VoxelGrid((2 * x, 2 * y, z), grid.voxel_size_m,
+                     (low_x - 0.5 * x * grid.voxel_size_m, low_y - 0.5 * y * grid.voxel_size_m, low_z))

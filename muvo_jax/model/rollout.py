@@ -82,8 +82,8 @@ def filter_embeddings(model: WorldModel, variables: Variables, embedding: jax.Ar
         state, (prior, posterior) = model.observe_step(variables, noise_t, state, action_t, embedding_t, is_first_t)
         deterministic = state.deterministic
         if speed_t is not None:
-            motion = state.vantage.motion.replace(speed_mps=speed_t)
-            state = state.replace(vantage=state.vantage.replace(motion=motion))
+            motion = dataclasses.replace(state.vantage.motion, speed_mps=speed_t)
+            state = dataclasses.replace(state, vantage=dataclasses.replace(state.vantage, motion=motion))
         return state, (deterministic, prior, posterior)
 
     inputs = jax.tree.map(_swap_time, (noise, previous, embedding, is_first, speed_mps))
@@ -115,11 +115,11 @@ def observe_window(model: WorldModel, variables: Variables, batch: Batch, keys: 
         noise = mean_mode(noise)
     moved = memory_lib.measured(model.config, batch) if model.config.tracks_motion else None
     observed = filter_embeddings(model, variables, embedding, batch.action, batch.is_first, noise,
-                                 moved and moved.speed_mps)
+                                 None if moved is None else moved.speed_mps)
     if model.config.tracks_motion:
         moved = moved or memory_lib.from_arrivals(model.ego_motion(variables, observed.states))
         states, remembered = memory_lib.of_window(model.config, batch, observed.states, moved)
-        observed = observed.replace(states=states, memory=remembered)
+        observed = dataclasses.replace(observed, states=states, memory=remembered)
     return observed, batch_stats
 
 
@@ -133,9 +133,12 @@ def observe(model: WorldModel, variables: Variables, key: jax.Array, batch: Batc
       sampled: sample the latents; otherwise take their means (the key is then not used).
 
     Raises:
-      ValueError: if the batch or the key does not fit.
+      ValueError: if the batch or the key does not fit, or a concrete input is not finite.
+      TypeError: for forward-mode derivatives through convolutions that have none (ModelConfig.convolution).
     """
     batch.validate()
+    checks.observation("observe", model, batch)
+    checks.forward_mode("observe", model, variables, batch)
     return _observe(model, variables, sample_keys(key, batch.batch_size), batch, sampled)
 
 
@@ -178,6 +181,7 @@ def imagine(model: WorldModel, variables: Variables, key: jax.Array, state: Late
         branches, horizon = checks.actions(actions_or_policy, lead, horizon, branches)
         driver = driver.reshape(count, *driver.shape[len(lead):])
     horizon = checks.counts(horizon, branches)
+    checks.finite("imagine", state=state, temperature=temperature)
     flat = jax.tree.map(lambda leaf: leaf.reshape(count, *leaf.shape[len(lead):]), state)
     dream = _imagine(model, variables, keys, flat, driver, jnp.float32(temperature), horizon, branches, sampled,
                      same_noise)
@@ -204,6 +208,7 @@ def imagine_step(model: WorldModel, variables: Variables, key: jax.Array, state:
     """
     lead = checks.state(model, state)
     action = checks.one_action(action, lead, "imagine_step")
+    checks.finite_on_host("imagine_step", state=state, temperature=temperature)
     keys = _keys_of(key, lead)
     flat = jax.tree.map(lambda leaf: leaf.reshape(len(keys), *leaf.shape[len(lead):]), state)
     after = _imagine_one(model, variables, keys, flat, action.reshape(len(keys), -1), jnp.float32(temperature), sampled)
@@ -216,8 +221,12 @@ def decode(model: WorldModel, variables: Variables, states: LatentState | Dream 
     """Decodes latent states (or their features) with any leading axes; see WorldModel.decode.
 
     A model with first_guess="last_seen" needs the `memory` of the drives too: Observed.memory or LiveState.memory.
+
+    Raises:
+      TypeError: for forward-mode derivatives through convolutions that have none (ModelConfig.convolution).
     """
     states = states.states if isinstance(states, Dream) else states
+    checks.forward_mode("decode", model, variables, states, memory)
     return _decode(model, variables, states, None if heads is None else tuple(heads), memory, rows)
 
 
@@ -290,7 +299,7 @@ def _advance(model, variables, keys, state, action, temperature):
     noise = jnp.zeros_like(state.stochastic)
     if temperature is not None:
         shape = state.stochastic.shape[1:]
-        noise = temperature * jax.vmap(lambda key: jax.random.normal(key, shape))(keys)
+        noise = temperature * jax.vmap(lambda key: jax.random.normal(key, shape, jnp.float32))(keys)
     return model.imagine_step(variables, noise, state, action)
 
 

@@ -101,8 +101,9 @@ class Network(linen.Module):
     def imagine_step(self, noise: jax.Array, state: LatentState, action: jax.Array) -> tuple[LatentState, Gaussian]:
         following, prior = self.transition.imagine_step(noise, state, action)
         if self.config.tracks_motion and self.config.kinematics is None:
-            step = self.ego_motion(following.features)
-            following = following.replace(vantage=memory_lib.moved_on(state.vantage, step))
+            assert state.vantage is not None  # of a model that tracks its motion
+            vantage = memory_lib.moved_on(state.vantage, self.ego_motion(following.features))
+            following = dataclasses.replace(following, vantage=vantage)
         return following, prior
 
     def ego_motion(self, features: jax.Array) -> Motion:
@@ -113,7 +114,11 @@ class Network(linen.Module):
 
     def decode(self, features: jax.Array, vantage: Vantage | None, memory: Memory | None, rows: jax.Array | None,
                names: tuple[str, ...]) -> dict[str, dict[int, jax.Array]]:
-        glimpses, numbers = ({}, None) if memory is None else memory_lib.look(self.config, memory, rows, vantage, names)
+        glimpses: dict[str, memory_lib.Glimpse] = {}
+        numbers = None
+        if memory is not None:
+            assert vantage is not None and rows is not None  # as memory.check returns them
+            glimpses, numbers = memory_lib.look(self.config, memory, rows, vantage, names)
         raw = {}
         for name in names:
             read = self.read(features, name)

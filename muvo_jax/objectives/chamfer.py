@@ -58,6 +58,6 @@ def frame_chamfer(some: types.Array, some_mask: types.Array, others: types.Array
 
 def _subset(cloud: types.Array, mask: types.Array, key: types.Array, points: int) -> tuple[types.Array, types.Array]:
     """At most `points` of the masked rows of a [P, 4] range view, without repetition, as [K, 3] and a mask."""
-    score = jnp.where(mask, jax.random.uniform(key, mask.shape, minval=0.5), 0.0)
+    score = jnp.where(mask, jax.random.uniform(key, mask.shape, jnp.float32, minval=0.5), 0.0)
     score, index = jax.lax.top_k(score, min(points, cloud.shape[0]))
     return cloud[index, :3], score > 0.0

@@ -171,6 +171,11 @@ def _per_axis(name: str, value: PerAxis, rank: int, lowest: int) -> tuple[int, .
     return values
 
 
+def reverse_only(implementation: str) -> bool:
+    """Whether convolutions of this implementation have reverse-mode derivatives alone."""
+    return implementation != "xla"
+
+
 Form = Callable[[jax.Array, jax.Array], jax.Array]  # (x, kernel) -> result
 
 

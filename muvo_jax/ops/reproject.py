@@ -7,6 +7,8 @@ axis N; all shapes are static.
 
 from __future__ import annotations
 
+import math
+
 import jax
 import jax.numpy as jnp
 
@@ -40,7 +42,7 @@ def splat(points_m: Array, valid: Array, geometry: RangeViewGeometry) -> Array:
     row, column, range_m = _polar(points_m, geometry)
     inside = valid & (row >= 0) & (row < geometry.rows)
     pixel = jnp.where(inside, row * geometry.columns + column, cells)
-    pixel = jax.lax.stop_gradient(pixel + (cells + 1) * jnp.arange(count)[:, None]).reshape(-1)
+    pixel = jax.lax.stop_gradient(pixel + (cells + 1) * jnp.arange(count, dtype=jnp.int32)[:, None]).reshape(-1)
     ranges = jax.lax.stop_gradient(range_m).reshape(-1)
     nearest = jnp.full((count * (cells + 1),), jnp.inf, jnp.float32).at[pixel].min(ranges)
     wins = ranges == nearest[pixel]
@@ -54,17 +56,18 @@ def splat(points_m: Array, valid: Array, geometry: RangeViewGeometry) -> Array:
 
 
 def move_image(image: Array, range_m: Array, pose: Array, intrinsics: Array, camera_to_ego: Array,
-               geometry: RangeViewGeometry) -> tuple[Array, Array]:
+               geometry: RangeViewGeometry, which: Array | None = None) -> tuple[Array, Array]:
     """Images [N, H, W, C] of one moment from another place, looked up through the ranges that are seen from there.
 
     A pixel above or below the lidar's field of view has the horizontal distance of the edge row of its column; one
     without a return lies FAR_M away.
 
     Args:
-      image: float32, of the old moment.
+      image: [S, H, W, C], of the old moment.
       range_m: [N, Hr, Wr], as seen from the NEW place, negative where nothing is (fill_holes).
       pose: [N, 3].
       intrinsics, camera_to_ego: [N, 3, 3] and [N, 4, 4] of the camera; the same at both places.
+      which: int32 [N], the image that each result looks up (nothing is copied); by default one each.
 
     Returns:
       float32 [N, H, W, C], bilinear, and bool [N, H, W], whether the pixel was inside the old image.
@@ -76,17 +79,30 @@ def move_image(image: Array, range_m: Array, pose: Array, intrinsics: Array, cam
     points_m = motion.out_of_frame(camera_m + rays * jnp.expand_dims(distance_m, -1), pose)
     u_px, v_px, ahead = _project(points_m, intrinsics, camera_to_ego)
     inside = ahead & (u_px >= 0) & (u_px <= columns) & (v_px >= 0) & (v_px <= rows)
-    values = _bilinear(image, v_px - 0.5, u_px - 0.5)
-    return values.reshape(image.shape), inside.reshape(image.shape[:3])
+    values, shape = _bilinear(image, v_px - 0.5, u_px - 0.5, which), (pose.shape[0], rows, columns)
+    return values.reshape(*shape, image.shape[3]), inside.reshape(shape)
 
 
-def move_voxels(values: Array, pose: Array, grid: VoxelGrid) -> Array:
-    """Voxels float32 [N, X, Y, Z] of one moment from another place: trilinear (heights stay), 0 beyond the grid."""
+def move_voxels(values: Array, pose: Array, grid: VoxelGrid, source: VoxelGrid | None = None,
+                which: Array | None = None) -> Array:
+    """Voxels of one moment from another place: trilinear (heights stay), 0 beyond the grid.
+
+    Args:
+      values: float32 [S, X', Y', C], of the old moment; C are heights, or several things for each of them.
+      pose: [N, 3].
+      grid: of the result.
+      source: of the values; the same by default.
+      which: int32 [N], which of the S each result looks at (nothing is copied); by default one each.
+
+    Returns:
+      float32 [N, X, Y, C].
+    """
+    source = source or grid
     ground_m = voxel_centres_m(grid)[:, :, 0].reshape(1, -1, 3)
-    moved = motion.out_of_frame(jnp.broadcast_to(ground_m, (values.shape[0], *ground_m.shape[1:])), pose)
-    place = [(moved[..., axis] - grid.origin_m[axis]) / grid.voxel_size_m - 0.5 for axis in (0, 1)]
-    shape = values.shape[:1] + tuple(grid.shape)
-    return _bilinear(values, place[0], place[1], outside_is_zero=True).reshape(shape)
+    moved = motion.out_of_frame(jnp.broadcast_to(ground_m, (pose.shape[0], *ground_m.shape[1:])), pose)
+    place = [(moved[..., axis] - source.origin_m[axis]) / source.voxel_size_m - 0.5 for axis in (0, 1)]
+    resampled = _bilinear(values, place[0], place[1], which, outside_is_zero=True)
+    return resampled.reshape(pose.shape[0], *grid.shape[:2], values.shape[-1])
 
 
 def voxel_centres_m(grid: VoxelGrid) -> Array:
@@ -94,6 +110,19 @@ def voxel_centres_m(grid: VoxelGrid) -> Array:
     axes = [grid.origin_m[axis] + grid.voxel_size_m * (jnp.arange(side, dtype=jnp.float32) + 0.5)
             for axis, side in enumerate(grid.shape)]
     return jnp.stack(jnp.meshgrid(*axes, indexing="ij"), axis=-1)
+
+
+def hit_voxels(points_m: Array, valid: Array, grid: VoxelGrid) -> Array:
+    """1 where a valid point [N, P] of points [N, P, 3] lies in the voxel, else 0: float32 [N, X, Y, Z]."""
+    count, cells = points_m.shape[0], math.prod(grid.shape)
+    number, inside = jnp.zeros(valid.shape, jnp.int32), valid
+    for axis, side in enumerate(grid.shape):
+        index = jnp.floor((points_m[..., axis] - grid.origin_m[axis]) / grid.voxel_size_m)
+        inside = inside & (index >= 0) & (index < side)
+        number = number * side + jnp.clip(index, 0, side - 1).astype(jnp.int32)
+    number = jnp.where(inside, number, cells) + (cells + 1) * jnp.arange(count)[:, None]
+    hits = jnp.zeros((count * (cells + 1),), jnp.float32).at[jax.lax.stop_gradient(number).reshape(-1)].set(1.0)
+    return hits.reshape(count, cells + 1)[:, :cells].reshape(count, *grid.shape)
 
 
 def scan_evidence(scans_m: Array, which: Array, pose: Array, grid: VoxelGrid, geometry: RangeViewGeometry) -> Array:
@@ -243,12 +272,17 @@ def _project(points_m: Array, intrinsics: Array, camera_to_ego: Array) -> tuple[
     return u_px, focal(1) * camera[..., 1] / depth_m + centre(1), ahead
 
 
-def _bilinear(values: Array, row: Array, column: Array, *, outside_is_zero: bool = False) -> Array:
-    """values [N, H, W, C] at places [N, P] (whole numbers are centres): [N, P, C]; edges repeat unless zero."""
-    count, rows, columns, channels = values.shape
-    flat = values.reshape(count, -1, channels)
+def _bilinear(values: Array, row: Array, column: Array, which: Array | None = None, *,
+              outside_is_zero: bool = False) -> Array:
+    """values [S, H, W, C] at places [N, P] (whole numbers are centres): float32 [N, P, C]; edges repeat unless zero.
+
+    which: int32 [N], the entry of `values` that a row of places looks at; by default one each.
+    """
+    entries, rows, columns, channels = values.shape
+    flat = values.reshape(-1, channels)
+    first = (jnp.arange(entries) if which is None else which)[:, None] * (rows * columns)
     top, left = jnp.floor(row), jnp.floor(column)
-    result = jnp.zeros((*row.shape, channels), values.dtype)
+    result = jnp.zeros((*row.shape, channels), jnp.float32)
     for down in (0, 1):
         for right in (0, 1):
             r, c = top + down, left + right
@@ -256,5 +290,6 @@ def _bilinear(values: Array, row: Array, column: Array, *, outside_is_zero: bool
             if outside_is_zero:
                 weight = jnp.where((r >= 0) & (r < rows) & (c >= 0) & (c < columns), weight, 0.0)
             index = jnp.clip(r, 0, rows - 1) * columns + jnp.clip(c, 0, columns - 1)
-            result = result + _rows(flat, index.astype(jnp.int32)) * jnp.expand_dims(weight, -1)
+            picked = flat[first + index.astype(jnp.int32)]
+            result = result + picked.astype(jnp.float32) * jnp.expand_dims(weight, -1)
     return result

@@ -45,12 +45,12 @@ def augment(batch: types.Batch, keys: types.Array, settings: AugmentationConfig)
 def augment_image(key: types.Array, image: types.Array, settings: AugmentationConfig) -> types.Array:
     """uint8 [H, W, 3] -> the same, blurred or sharpened, and with other colours, each with its probability."""
     key_filter, key_std, key_factor, key_coin, key_colour = jax.random.split(key, 5)
-    share = jax.random.uniform(key_filter)
+    share = jax.random.uniform(key_filter, (), jnp.float32)
     original = image.astype(jnp.float32) / 255.0
-    blurred = photometric.blur(original, jax.random.uniform(key_std, minval=settings.blur_std_px[0],
+    blurred = photometric.blur(original, jax.random.uniform(key_std, (), jnp.float32, minval=settings.blur_std_px[0],
                                                             maxval=settings.blur_std_px[1]))
-    sharpened = photometric.sharpen(original, jax.random.uniform(key_factor, minval=settings.sharpen_factor[0],
-                                                                 maxval=settings.sharpen_factor[1]))
+    low, high = settings.sharpen_factor
+    sharpened = photometric.sharpen(original, jax.random.uniform(key_factor, (), jnp.float32, minval=low, maxval=high))
     filtered = jnp.where(share < settings.blur, blurred,
                          jnp.where(share < settings.blur + settings.sharpen, sharpened, original))
     coloured = _other_colours(key_colour, filtered, settings)
@@ -62,7 +62,7 @@ def _other_colours(key: types.Array, image: types.Array, settings: AugmentationC
     """Brightness, contrast, saturation and hue, one after the other in an order that is drawn too."""
     key_order, key_amount = jax.random.split(key)
     most = jnp.asarray([settings.brightness, settings.contrast, settings.saturation, settings.hue], jnp.float32)
-    amount = most * jax.random.uniform(key_amount, (4,), minval=-1.0)
+    amount = most * jax.random.uniform(key_amount, (4,), jnp.float32, minval=-1.0)
     changes = (lambda value: photometric.brightness(value, 1.0 + amount[0]),
                lambda value: photometric.contrast(value, 1.0 + amount[1]),
                lambda value: photometric.saturation(value, 1.0 + amount[2]),
@@ -77,7 +77,7 @@ def augment_route(key: types.Array, maps: types.Array, settings: AugmentationCon
     key_kind, key_rows, key_small, key_large = jax.random.split(key, 4)
     limits = jnp.cumsum(jnp.asarray([settings.route_drop, settings.route_truncate, settings.route_affine_small,
                                      settings.route_affine_large], jnp.float32))
-    kind = jnp.searchsorted(limits, jax.random.uniform(key_kind), side="right")
+    kind = jnp.searchsorted(limits, jax.random.uniform(key_kind, (), jnp.float32), side="right")
     side = maps.shape[-1]
     near = jnp.arange(side) >= jax.random.randint(key_rows, (), 0, side)
     truncated = jnp.where(near[None, :, None], maps, 0)
@@ -89,9 +89,10 @@ def augment_route(key: types.Array, maps: types.Array, settings: AugmentationCon
 def _random_affine(key: types.Array, degrees: float, side: int, settings: AugmentationConfig) -> dict:
     key_angle, key_shift, key_scale = jax.random.split(key, 3)
     most_px = settings.route_translation * side
-    return {"angle_rad": jnp.deg2rad(jax.random.uniform(key_angle, minval=-degrees, maxval=degrees)),
-            "shift_px": jnp.round(jax.random.uniform(key_shift, (2,), minval=-most_px, maxval=most_px)),
-            "scale": jax.random.uniform(key_scale, minval=settings.route_scale[0], maxval=settings.route_scale[1]),
+    return {"angle_rad": jnp.deg2rad(jax.random.uniform(key_angle, (), jnp.float32, minval=-degrees, maxval=degrees)),
+            "shift_px": jnp.round(jax.random.uniform(key_shift, (2,), jnp.float32, minval=-most_px, maxval=most_px)),
+            "scale": jax.random.uniform(key_scale, (), jnp.float32, minval=settings.route_scale[0],
+                                        maxval=settings.route_scale[1]),
             "shear_rad": jnp.deg2rad(jnp.float32(settings.route_shear_deg))}
 
 

@@ -58,7 +58,7 @@ class Checkpoints:
     def __init__(self, run_folder: str | os.PathLike, *, keep_last: int = 2, keep_best: int = 1):
         """Keeps the `keep_last` newest (at least two: a damaged one needs a predecessor) and the best by score."""
         _quiet()
-        self.run_folder = pathlib.Path(run_folder).resolve()
+        self.run_folder = pathlib.Path(run_folder).expanduser().resolve()
         self.folder = self.run_folder / FOLDER
         self._policy = _preservation.AnyPreservationPolicy([
             _preservation.LatestN(max(2, keep_last)),
@@ -182,7 +182,7 @@ def save_variables(run_folder: str | os.PathLike, step: int, variables: types.Va
       OSError: where it cannot be written.
     """
     _quiet()
-    folder = pathlib.Path(run_folder).resolve() / FOLDER / str(step)
+    folder = pathlib.Path(run_folder).expanduser().resolve() / FOLDER / str(step)
     folder.mkdir(parents=True)
     with ocp.StandardCheckpointer() as writer:
         writer.save(folder / "variables", {"params": variables["params"], "batch_stats": variables["batch_stats"]})
@@ -203,7 +203,7 @@ def load_run(run: str | os.PathLike, which: int | str = "latest") -> run_lib.Run
       CheckpointError: where there is no run, no such checkpoint, or none that can be read.
       ValueError: where it was written by a version with an unknown schema or configuration.
     """
-    folder = pathlib.Path(run).resolve()
+    folder = pathlib.Path(run).expanduser().resolve()
     checkpoints = folder / FOLDER
     found = _steps(checkpoints)
     if not found:

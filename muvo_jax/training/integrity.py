@@ -31,7 +31,7 @@ def damage(folder: pathlib.Path) -> str | None:
 
 def set_aside(folder: pathlib.Path, run_folder: str | os.PathLike) -> pathlib.Path:
     """Moves a checkpoint out of the way (RUN/damaged_checkpoints), so that its step can be written again."""
-    target = pathlib.Path(run_folder) / DAMAGED_FOLDER / folder.name
+    target = pathlib.Path(run_folder).expanduser() / DAMAGED_FOLDER / folder.name
     copy = 1
     while target.exists():
         copy += 1

@@ -29,10 +29,10 @@ def randomly(batch: types.Batch, keys: types.Array) -> types.Batch:
 
     def draw(key):
         coin, bright, tint, haze, grey = jax.random.split(jax.random.fold_in(key, _SITE), 5)
-        share = jax.random.uniform(haze, (), maxval=HAZE)
-        factor = jax.random.uniform(bright, (), minval=BRIGHTNESS[0], maxval=BRIGHTNESS[1]) * jax.random.uniform(
-            tint, (3,), minval=TINT[0], maxval=TINT[1])
-        offset = share * jax.random.uniform(grey, (), minval=100.0, maxval=210.0)
+        share = jax.random.uniform(haze, (), jnp.float32, maxval=HAZE)
+        factor = jax.random.uniform(bright, (), jnp.float32, minval=BRIGHTNESS[0], maxval=BRIGHTNESS[1])
+        factor = factor * jax.random.uniform(tint, (3,), jnp.float32, minval=TINT[0], maxval=TINT[1])
+        offset = share * jax.random.uniform(grey, (), jnp.float32, minval=100.0, maxval=210.0)
         on = jax.random.bernoulli(coin)
         return jnp.where(on, factor * (1.0 - share), 1.0), jnp.where(on, offset, 0.0)
 

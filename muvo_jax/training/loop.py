@@ -19,7 +19,7 @@ import jax
 
 from muvo_jax import config as config_lib
 from muvo_jax import types
-from muvo_jax.data import pipeline, prepare, schema
+from muvo_jax.data import pipeline, prepare, schema, words
 from muvo_jax.objectives import perceptual
 from muvo_jax.training import checkpoint, checkpoint_meta, host, preparation, run_folder, screen, start, validation
 
@@ -91,7 +91,7 @@ def train(job: Job, show: screen.Screen) -> Outcome:
         frames = pipeline.Frames(recording, config)
         source = pipeline.train_batches(frames, seed=config.train.seed, batch=windows_per_step(config))
         shapes = preparation.expected_batch(config, windows_per_step(config),
-                                            recorded=recording.description.modalities)
+                                            recorded=schema.in_every_frame(recording))
         ready = early.result()
         ready = (preparation.recompile(ready, config, shapes, job.frozen) if ready
                  else preparation.prepare(config, shapes, job.frozen))
@@ -163,7 +163,8 @@ def _introduce(job: Job, show: screen.Screen, config: config_lib.Config, ready: 
     show.field("model", f"{config.model.variant} ({config.model.latent}), {ready.parameters:,} parameters, heads "
                         f"{', '.join(config.model.heads)}")
     extra = f" x {accumulate} accumulated" if accumulate > 1 else ""
-    show.field("steps", f"{config.train.steps} of {config.train.batch} windows{extra}, {ready.step.plan.describe()}")
+    batch = words.counted(config.train.batch, "window")
+    show.field("steps", f"{config.train.steps} of {batch}{extra}, {ready.step.plan.describe()}")
     if job.frozen is not None:
         show.field("perceptual", f"pictures are compared by {job.frozen.source}, frozen")
     show.field("run", str(job.folder))
@@ -290,8 +291,8 @@ class _Run:
         steady_s = self.step_times_s[1:]
         if steady_s:
             mean_s, age_s = sum(steady_s) / len(steady_s), time.perf_counter() - self.job.started_s
-            self.show.line(f"{len(self.step_times_s)} steps, {mean_s:.3f} s each on average; peak memory "
-                           f"{host.peak_memory_gib():.2f} GiB; {screen.duration_text(age_s)} since the start")
+            self.show.line(f"{words.counted(len(self.step_times_s), 'step')}, {mean_s:.3f} s each on average; peak "
+                           f"memory {host.peak_memory_gib():.2f} GiB; {screen.duration_text(age_s)} since the start")
         elif not self.step_times_s:
             self.show.line(f"nothing left to train: step {self.done} of {total} is reached (more with --steps).")
 

@@ -54,7 +54,7 @@ class Prepared:
         return parallel_lib.place_state(self.step.plan, state)
 
 
-TOWN_RECORDS = frozenset({"reward", "speed_mps"})
+TOWN_RECORDS = frozenset({"reward", "is_terminal", "speed_mps"})
 
 
 def expected_batch(config: config_lib.Config, windows: int, *,
@@ -63,7 +63,7 @@ def expected_batch(config: config_lib.Config, windows: int, *,
 
     Args:
       config: adapted to the data, or a preset of the built-in town.
-      recorded: modalities of the recording (schema.RecordingDescription); by default what the built-in town has of
+      recorded: what every frame of the recording has (schema.in_every_frame); by default what the built-in town has of
         those that every batch brings along, whatever the model reads.
     """
     model, prefix = config.model, (windows, config.data.frames)
@@ -80,10 +80,7 @@ def expected_batch(config: config_lib.Config, windows: int, *,
     if model.camera != config_lib.NO_SENSOR or "image" in config.targets:
         fields |= {"intrinsics": shape(np.float32, 3, 3), "camera_to_ego": shape(np.float32, 4, 4)}
     fields |= {name: timed(types.BATCH_FIELDS[name][0], *sizes) for name, sizes in config.targets.items()}
-    if "reward" in recorded:
-        fields |= {"reward": timed(np.float32), "is_terminal": timed(np.bool_)}
-    if "speed_mps" in recorded:
-        fields["speed_mps"] = timed(np.float32)
+    fields |= {name: timed(types.BATCH_FIELDS[name][0]) for name in sorted(TOWN_RECORDS.intersection(recorded))}
     fields["action"] = timed(np.float32, 2)
     return types.Batch(is_first=timed(np.bool_), **fields)
 

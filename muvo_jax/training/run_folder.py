@@ -23,7 +23,7 @@ class RunFolder:
     """Files of one run. Records are appended line by line, so that a killed run loses none that it reported."""
 
     def __init__(self, path: str | os.PathLike, first_step: int = 0):
-        self.path = pathlib.Path(path)
+        self.path = pathlib.Path(path).expanduser()
         self._events = tensorboardX.SummaryWriter(str(self.path), purge_step=first_step or None)
         self._metrics = (self.path / METRICS_FILE).open("a", encoding="utf-8")
 
@@ -51,7 +51,7 @@ def check_new(path: str | os.PathLike, again: str) -> None:
     Raises:
       FileExistsError: where it exists and is not empty; nothing in it is touched.
     """
-    path = pathlib.Path(path)
+    path = pathlib.Path(path).expanduser()
     if path.is_dir() and any(path.iterdir()):
         has_steps = bool(list((path / checkpoint.FOLDER).glob("*")))
         state = "has checkpoints" if has_steps else "has no checkpoint yet"
@@ -64,13 +64,13 @@ def check_new(path: str | os.PathLike, again: str) -> None:
 def create(path: str | os.PathLike, config: config_lib.Config, again: str) -> None:
     """Makes the folder of a new run and writes its config; refuses as `check_new` does."""
     check_new(path, again)
-    pathlib.Path(path).mkdir(parents=True, exist_ok=True)
+    pathlib.Path(path).expanduser().mkdir(parents=True, exist_ok=True)
     write_config(path, config)
 
 
 def write_config(path: str | os.PathLike, config: config_lib.Config) -> None:
     """Writes RUN/config.json; the file is replaced as a whole."""
-    target = pathlib.Path(path) / CONFIG_FILE
+    target = pathlib.Path(path).expanduser() / CONFIG_FILE
     partial = target.with_name(CONFIG_FILE + ".part")
     partial.write_text(json.dumps(config.to_dict(), indent=2) + "\n", encoding="utf-8")
     partial.replace(target)
@@ -83,7 +83,7 @@ def read_config(path: str | os.PathLike) -> config_lib.Config:
       FileNotFoundError: where there is no run.
       ValueError: where its config.json cannot be understood.
     """
-    source = pathlib.Path(path) / CONFIG_FILE
+    source = pathlib.Path(path).expanduser() / CONFIG_FILE
     try:
         return config_lib.Config.from_dict(json.loads(source.read_text(encoding="utf-8")))
     except FileNotFoundError as error:
@@ -96,7 +96,7 @@ def read_config(path: str | os.PathLike) -> config_lib.Config:
 
 def read_metrics(path: str | os.PathLike) -> list[dict[str, Any]]:
     """All records of a run, oldest first; a line cut short by a crash is left out."""
-    source = pathlib.Path(path) / METRICS_FILE
+    source = pathlib.Path(path).expanduser() / METRICS_FILE
     records = []
     for line in source.read_text(encoding="utf-8").splitlines() if source.is_file() else []:
         try:
@@ -112,7 +112,7 @@ def forget_after(path: str | os.PathLike, step: int) -> int:
     kept = [record for record in records if record["step"] <= step]
     if len(kept) == len(records):
         return 0
-    target = pathlib.Path(path) / METRICS_FILE
+    target = pathlib.Path(path).expanduser() / METRICS_FILE
     partial = target.with_name(METRICS_FILE + ".part")
     partial.write_text("".join(json.dumps(record) + "\n" for record in kept), encoding="utf-8")
     partial.replace(target)

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import contextlib
+import os
+import sys
 import time
 from collections.abc import Callable, Iterator, Mapping
 
@@ -11,11 +13,18 @@ import rich.progress
 import rich.text
 
 
+class _Console(rich.console.Console):
+    def on_broken_pipe(self) -> None:
+        """Goes on in silence where the reader has left, as in | head: files and exit code are what counts."""
+        self.quiet = True
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # takes what is still buffered
+
+
 class Screen:
     """A console with one progress bar; in a log file or a pipe, plain lines take the place of the bar."""
 
     def __init__(self, console: rich.console.Console | None = None):
-        self.console = console or rich.console.Console(highlight=False, soft_wrap=True)
+        self.console = console or _Console(highlight=False, soft_wrap=True)
         if not self.console.is_terminal:  # a file or a pipe has no width of its own
             self.console.width = 120
         self._bar: rich.progress.Progress | None = None
@@ -33,7 +42,10 @@ class Screen:
 
     @contextlib.contextmanager
     def counter(self, title: str, unit: str) -> Iterator[Callable[[int, int], None]]:
-        """Yields progress(done, total) for something that may take a while; shows nothing where it is never called."""
+        """Yields progress(done, total) for something that may take a while; shows nothing where it is never called.
+
+        Where the work ends without an error, all of it is done.
+        """
         if self.console.is_terminal:
             progress = rich.progress
             bar = progress.Progress(progress.TextColumn(title), progress.BarColumn(bar_width=24),
@@ -43,16 +55,19 @@ class Screen:
             with bar:
                 yield lambda done, total: bar.update(task, completed=done, total=total, visible=True)
             return
-        told = -1
+        told, last = -1, (0, 0)
 
         def tell(done: int, total: int) -> None:
-            nonlocal told
+            nonlocal told, last
+            last = done, total
             quarter = 4 * done // max(total, 1)
             if quarter > told:
                 told = quarter
                 self.line(f"{title}: {done}/{total} {unit}")
 
         yield tell
+        if told >= 0 and last[0] < last[1]:  # the rest was there already, or was not worth a report
+            tell(last[1], last[1])
 
     def start(self, total: int, done: int) -> None:
         """Shows the bar for `total` steps of which `done` are behind us."""

@@ -148,7 +148,7 @@ def swatch(colour: Colour, text: str) -> np.ndarray:
 
 def save_png(path: str | os.PathLike, picture: np.ndarray) -> pathlib.Path:
     """Writes a PNG, creating its folder; the file appears only when it is complete."""
-    path = pathlib.Path(path)
+    path = pathlib.Path(path).expanduser()
     path.parent.mkdir(parents=True, exist_ok=True)
     partial = path.with_name(path.name + ".part")
     Image.fromarray(picture).save(partial, format="PNG", optimize=True)
@@ -168,7 +168,7 @@ def save_gif(path: str | os.PathLike, pictures: Sequence[np.ndarray], frame_s: f
     """
     if not pictures:
         raise ValueError(f"{path}: got no frames, expected at least one.")
-    path = pathlib.Path(path)
+    path = pathlib.Path(path).expanduser()
     path.parent.mkdir(parents=True, exist_ok=True)
     samples = np.concatenate([picture[::2, ::2] for picture in pictures[:: max(1, len(pictures) // 6)]], axis=0)
     palette = Image.fromarray(samples).quantize(255, method=Image.Quantize.MEDIANCUT)

@@ -180,7 +180,7 @@ def write_dream(folder: str | os.PathLike, truth: Sequence[View], predictions: M
       most_moments: the sheets show at most this many frames, evenly spread, the last one included.
       animate: also write the animation.
     """
-    folder = pathlib.Path(folder)
+    folder = pathlib.Path(folder).expanduser()
     fitted = lambda several: {label: [view.beside(truth[frame]) for frame, view in enumerate(views)]
                               for label, views in several.items()}
     beside, predictions = fitted(beside or {}), fitted(predictions)

@@ -12,4 +12,5 @@ def find(variable: str, *names: str) -> pathlib.Path | None:
 
 
 MUVO_LAYOUT = find("MUVO_LAYOUT", "data/muvo_layout")
+KITTI = find("MUVO_KITTI", "data/kitti_raw")
 GOLDEN = find("MUVO_GOLDEN", "golden")

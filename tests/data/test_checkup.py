@@ -1,13 +1,17 @@
 """What the doctor finds: each fault is found where it is, and named by nothing else."""
 
+import dataclasses
 import re
+import types
 
 import numpy as np
 import pytest
+import recording_samples as samples
 import recording_writers as writers
+import street_scene
 
 from muvo_jax import config as config_lib
-from muvo_jax.data import alignment, checkup, judgements, plain
+from muvo_jax.data import alignment, checkup, judgements, kitti, plain
 from muvo_jax.ops import camera as camera_ops
 
 CONTRACT = config_lib.ActionContract()
@@ -92,6 +96,62 @@ def test_a_camera_that_is_off_is_measured(shift_px):
     assert (found.gain > 1.03) == (shift_px != (0, 0))
 
 
+@pytest.mark.parametrize("error_rad", [(0.0, 0.0), (0.05, 0.0), (-0.04, 0.03)])
+@pytest.mark.parametrize("rows", [16, 32, 64, 128])
+def test_a_turned_camera_is_measured_within_a_row_on_a_street_with_ground(rows, error_rad):
+    frames = [street_scene.frame(seed, rows, right_rad=error_rad[0], down_rad=error_rad[1]) for seed in range(6)]
+    found = alignment.measure(frames, street_scene.lidar(rows))
+    true_px = np.tan(error_rad) * street_scene.INTRINSICS[0, 0]
+    row_px = street_scene.INTRINSICS[0, 0] * np.radians(30.0) / rows
+    assert found.is_known and found.row_px == pytest.approx(row_px, rel=0.1)
+    assert max(abs(found.right_px - true_px[0]), abs(found.down_px - true_px[1])) <= row_px
+    recording = types.SimpleNamespace(description=types.SimpleNamespace(
+        camera=types.SimpleNamespace(intrinsics=street_scene.INTRINSICS.tolist()), lidar=street_scene.lidar(rows)))
+    (finding,) = judgements.of_alignment(found, recording)
+    assert finding.level == ("remark" if error_rad == (0.0, 0.0) else "problem")
+
+
+@pytest.mark.parametrize("slope", [0.05, -0.04])
+def test_a_road_that_rises_is_no_edge(slope):
+    frames = [street_scene.frame(seed, 16, slope=slope) for seed in range(6)]
+    found = alignment.measure(frames, street_scene.lidar(16))
+    assert found.is_known and max(abs(found.right_px), abs(found.down_px)) <= 2
+
+
+def test_flat_ground_alone_has_no_gaps():
+    flat = street_scene.scan(0, 32, 0.0)
+    flat = flat[np.abs(flat[:, 2]) < 0.1]
+    assert len(flat) > 5000
+    gaps = alignment.find_gaps(flat, street_scene.lidar(32))
+    assert len(gaps.above) + len(gaps.beside) == 0
+
+
+def row_rad(lidar):
+    return (lidar.elevation_max_rad - lidar.elevation_min_rad) / lidar.rows
+
+
+@pytest.mark.skipif(samples.KITTI is None, reason="no KITTI recording here")
+@pytest.mark.parametrize("error_rad", [(0.0, 0.0), (0.05, 0.0), (-0.035, 0.03)])
+@pytest.mark.parametrize("keep_every", [1, 2, 4])
+def test_thinned_kitti_is_measured_within_a_row(keep_every, error_rad):
+    recording = kitti.KittiRecording(samples.KITTI)
+    frames = [recording.read(sequence, index) for sequence in recording.sequences for index in range(0, 30, 5)
+              if index < sequence.length]
+    thinned = dataclasses.replace(kitti.LIDAR, rows=64 // keep_every)
+    for frame in frames:
+        relative_m = frame["points_m"] - np.array(kitti.LIDAR.position_m)
+        elevation_rad = np.arctan2(relative_m[:, 2], np.hypot(relative_m[:, 0], relative_m[:, 1]))
+        image_row = ((kitti.LIDAR.elevation_max_rad - elevation_rad) / row_rad(kitti.LIDAR)).astype(int)
+        frame["points_m"] = frame["points_m"][image_row % keep_every == keep_every // 2]
+        turned = street_scene.turn(-error_rad[0], error_rad[1]) @ frame["camera_to_ego"][:3, :3]
+        frame["camera_to_ego"] = np.block([[turned, frame["camera_to_ego"][:3, 3:]], [np.eye(4)[3:]]])
+    found = alignment.measure(frames, thinned)
+    focal_px = frames[0]["intrinsics"][0, 0]
+    assert found.is_known
+    assert abs(np.arctan(found.right_px / focal_px) - error_rad[0]) <= row_rad(thinned)
+    assert abs(np.arctan(found.down_px / focal_px) - error_rad[1]) <= row_rad(thinned)
+
+
 def test_nothing_is_said_about_pictures_without_edges():
     frames = [scene(seed) for seed in range(4)]
     for frame in frames:
@@ -119,3 +179,40 @@ def test_stretches_are_spread_and_limited(tmp_path):
     result = checkup.examine(recording, frames=120)
     assert result.facts["read"] == "65 of 65 frames looked at"
     assert set(result.motion.stretch) == {0, 1}
+
+
+def driven(**changes):
+    """The drive with the poses that its speed and yaw rate lead to."""
+    motion = drive()
+    yaw_rad = np.cumsum(np.append(0, motion.yaw_rate_radps[:-1] * 0.1))
+    step_m = motion.speed_mps[:, None] * np.stack([np.cos(yaw_rad), np.sin(yaw_rad)], axis=1) * 0.1
+    place_m = np.cumsum(np.concatenate([np.zeros((1, 2)), step_m[:-1]]), axis=0)
+    return dataclasses.replace(motion, pose=np.column_stack([place_m, yaw_rad]), **changes)
+
+
+@pytest.mark.parametrize(("change", "message"), [
+    (lambda motion: {}, None),
+    (lambda motion: {"speed_mps": motion.speed_mps * 3.6}, r"speed_mps is 3\.\d+ times .*km/h"),
+    (lambda motion: {"pose": motion.pose * [1000, 1000, 1]}, r"speed_mps is 0\.00 times .*km/s"),
+    (lambda motion: {"pose": motion.pose * [1, 1, 57.2958]}, "must be in radians"),
+])
+def test_units_are_compared_with_the_motion(change, message):
+    motion = driven()
+    found = judgements.of_units(dataclasses.replace(motion, **change(motion)))
+    assert len(found) == (message is not None)
+    assert all(re.search(message, finding.text) and finding.level == "problem" for finding in found)
+
+
+def test_points_in_centimetres_are_found(tmp_path):
+    root = writers.write_plain(tmp_path / "rec")
+    for path in root.glob("*/*/lidar/*.npz"):
+        np.savez(path, points_m=np.random.default_rng(0).uniform(-4000, 4000, (100, 3)).astype(np.float32))
+    texts = [finding.text for finding in checkup.examine(plain.PlainRecording(root)).findings]
+    assert any("are they in metres?" in text for text in texts)
+
+
+def test_nothing_to_look_at_is_a_problem(tmp_path):
+    described = plain.PlainRecording(writers.write_plain(tmp_path / "rec")).description
+    empty = types.SimpleNamespace(sequences=(), description=described)
+    assert any("not one frame" in finding.text and finding.level == "problem"
+               for finding in checkup.examine(empty).findings)

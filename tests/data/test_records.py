@@ -1,16 +1,25 @@
 """Packing: what comes out is what went in, and nothing is lost by kills, damage or a second packer."""
 
+import contextlib
 import json
 import os
 import pathlib
+import pickle
+import shutil
 import signal
+import struct
 import subprocess
 import sys
 import time
+import tracemalloc
+import zlib
 
 import numpy as np
 import pytest
 import recording_writers as writers
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from PIL import Image
 
 from muvo_jax.data import plain, records, schema, shards, sources
 
@@ -121,3 +130,174 @@ def test_records_are_not_unpickled_and_lossy_ones_are_smaller(source):
     np.testing.assert_allclose(records.decode_frame(lossy, "here")["points_m"], frame["points_m"], atol=0.032)
     with pytest.raises(ValueError):
         records.encode_frame({"image": np.array([{}], object)}, records.Encoding())
+
+
+def test_more_shards_than_a_process_may_open(source, tmp_path):
+    out = tmp_path / "many"
+    assert shards.pack(source, out, frames_per_shard=1, workers=1)
+    code = ("import resource, sys\nfrom muvo_jax.data import records\n"
+            "records._OPEN_READERS = 4\nrecording = records.PackedRecording(sys.argv[1])\n"
+            "resource.setrlimit(resource.RLIMIT_NOFILE, (16, 16))\n"
+            "for _ in range(2):\n    for sequence in recording.sequences:\n"
+            "        for index in range(sequence.length):\n            recording.read(sequence, index)\n")
+    done = subprocess.run([sys.executable, "-c", code, str(out)], cwd=ROOT, env=os.environ | {"PYTHONPATH": str(ROOT)},
+                          capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+
+
+def test_readers_are_bounded_and_closed(source, tmp_path, monkeypatch):
+    assert shards.pack(source, tmp_path / "out", frames_per_shard=1, workers=1)
+    monkeypatch.setattr(records, "_OPEN_READERS", 3)
+    recording = records.PackedRecording(tmp_path / "out")
+    before = len(os.listdir("/proc/self/fd"))
+    first = frames_of(recording)
+    assert len(os.listdir("/proc/self/fd")) - before <= 3
+    recording.close()
+    assert len(os.listdir("/proc/self/fd")) == before
+    for left, right in zip(first, frames_of(pickle.loads(pickle.dumps(recording))), strict=True):
+        assert_same(left, right)
+
+
+def test_several_workers_write_what_one_writes(source, packed, tmp_path):
+    progress = []
+    assert shards.pack(source, tmp_path / "two", frames_per_shard=5, workers=2,
+                       progress=lambda *counts: progress.append(counts))
+    assert (tmp_path / "two/manifest.json").read_text() == (packed / "manifest.json").read_text()
+    assert progress[-1] == (24, 24)
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+def test_an_error_is_the_same_from_one_worker_and_from_several(source, tmp_path, workers):
+    broken = shutil.copytree(source, tmp_path / "broken")
+    (broken / "train/b/lidar/000003.npz").write_bytes(b"nothing")
+    with pytest.raises(schema.DataError, match=r"000003.npz: not a readable NPZ file"):
+        shards.pack(broken, tmp_path / "out", frames_per_shard=5, workers=workers)
+    assert not (tmp_path / "out/manifest.json").exists()
+
+
+def test_a_corrected_source_packs_anew_what_it_touches(source, tmp_path):
+    recording, out = shutil.copytree(source, tmp_path / "copy"), tmp_path / "out"
+    assert shards.pack(recording, out, frames_per_shard=4, workers=1)
+    times = {path.name: path.stat().st_mtime_ns for path in out.glob("*.arrayrecord")}
+    corrected = np.full((16, 16, 16), 1, np.uint8)
+    np.savez(recording / "train/b/occupancy/000002.npz", occupancy=corrected)
+    assert shards.pack(recording, out, frames_per_shard=4, workers=1)
+    changed = {name for name, time_ns in times.items() if (out / name).stat().st_mtime_ns != time_ns}
+    # Run a has 10 frames, b the next 6: shards of 4 that hold some of b are 2 and 3.
+    assert changed == {"shard-00002.arrayrecord", "shard-00003.arrayrecord"}
+    assert any(np.array_equal(frame["occupancy"], corrected) for frame in frames_of(records.PackedRecording(out)))
+    (recording / "val_rl/c/image/000007.png").unlink()  # one frame less: the last shard is shorter
+    with pytest.warns(schema.DataWarning):
+        assert shards.pack(recording, out, frames_per_shard=4, workers=1)
+    assert len(frames_of(records.PackedRecording(out))) == 23
+
+
+@pytest.mark.parametrize("place", [".", "inside", ".."])
+def test_source_and_target_lie_apart(source, tmp_path, place):
+    recording = shutil.copytree(source, tmp_path / "there/copy")
+    with pytest.raises(ValueError, match="lie in one another"):
+        shards.pack(recording, recording / place, workers=1)
+
+
+def test_the_camera_is_chosen(tmp_path):
+    drive = writers.write_kitti(tmp_path)
+    shutil.copytree(drive / "image_02", drive / "image_00")
+    calibration = drive.parent / "calib_cam_to_cam.txt"
+    assert shards.pack(drive, tmp_path / "out", camera="image_00", workers=1)
+    assert calibration.is_file()
+    left, right = sources.open_recording(drive, camera="image_00"), sources.open_recording(tmp_path / "out")
+    assert left.description.camera == right.description.camera
+    with pytest.raises(FileExistsError, match="other settings"):
+        shards.pack(drive, tmp_path / "out", camera="image_02", workers=1)
+
+
+def test_labels_are_packed_and_left_out_where_nobody_asks(source, tmp_path):
+    recording = shutil.copytree(source, tmp_path / "copy")
+    for image in recording.glob("*/*/image/*.png"):
+        folder = image.parents[1] / "depth"
+        folder.mkdir(exist_ok=True)
+        Image.fromarray(np.full((32, 64), 500, np.uint16)).save(folder / image.name)
+    assert shards.pack(recording, tmp_path / "out", workers=1)
+    with_labels = sources.open_recording(tmp_path / "out", labels=schema.LABELS)
+    expected = sources.open_recording(recording, labels=schema.LABELS)
+    assert with_labels.description.modalities == expected.description.modalities >= {"depth_m"}
+    for left, right in zip(frames_of(expected), frames_of(with_labels), strict=True):
+        assert_same(left, right)
+    assert shards.pack(recording, tmp_path / "without", labels=False, workers=1)
+    assert "depth_m" not in sources.open_recording(tmp_path / "without", labels=schema.LABELS).description.modalities
+    without = sources.open_recording(tmp_path / "out")
+    assert "depth_m" not in without.description.modalities | frames_of(without)[0].keys()
+
+
+_LEAVES = st.sampled_from([None, True, -1, 0, 3, 2**63, 10**30, 1.5, float("nan"), "", "../x", [], [[]], {}, {"a": 1},
+                           "shard-00000.arrayrecord"])
+
+
+@settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(data=st.data())
+def test_a_malformed_manifest_is_a_data_error(packed, data):
+    content = json.loads((packed / "manifest.json").read_text())
+    node = content
+    while isinstance(node, dict | list) and node:
+        key = data.draw(st.sampled_from(sorted(node) if isinstance(node, dict) else range(len(node))))
+        child = node[key]
+        if not isinstance(child, dict | list) or not child or data.draw(st.booleans()):
+            break
+        node = child
+    if data.draw(st.booleans()) and isinstance(node, dict):
+        del node[key]
+    else:
+        node[key] = data.draw(_LEAVES)
+    folder = packed.with_name("fuzzed")
+    if not folder.exists():
+        shutil.copytree(packed, folder)
+    (folder / "manifest.json").write_text(json.dumps(content))
+    with contextlib.suppress(schema.DataError):
+        frames_of(records.PackedRecording(folder))
+
+
+def test_a_manifest_that_claims_more_than_there_is_takes_no_memory(packed):
+    content = json.loads((packed / "manifest.json").read_text())
+    content["frames_per_shard"] = 10**12
+    content["shards"] = content["shards"][:1]
+    content["shards"][0]["frames"] = content["sequences"][0]["length"] = 10**12
+    content["sequences"] = content["sequences"][:1]
+    (packed / "manifest.json").write_text(json.dumps(content))
+    with pytest.raises(schema.DataError, match="frames in"):
+        records.PackedRecording(packed)
+
+
+def record_of(fields, content):
+    """A record with a true checksum, whatever its header claims."""
+    text = json.dumps(fields).encode()
+    body = struct.pack("<I", len(text)) + text + content
+    return body + struct.pack("<I", zlib.crc32(body))
+
+
+@pytest.mark.parametrize("field", [
+    {"dtype": "<f8", "shape": [10**6, 10**6], "encoding": "zlib"},
+    {"dtype": "<f4", "shape": [4], "encoding": "zlib"},
+    {"dtype": "|u1", "shape": [4, 4, 3], "encoding": "png"},
+    {"dtype": "|O", "shape": [1], "encoding": "raw"},
+    {"dtype": "<f4", "shape": [-1], "encoding": "raw"},
+    {"dtype": "nonsense", "shape": [1], "encoding": "raw"},
+    {"dtype": "<f4", "shape": None, "encoding": "raw"},
+])
+def test_records_that_lie_are_data_errors_and_take_no_memory(field):
+    bomb = zlib.compress(bytes(50_000_000), 9)
+    record = record_of([{"name": "image", "bytes": len(bomb)} | field], bomb)
+    tracemalloc.start()
+    with pytest.raises(schema.DataError, match="here: damaged"):
+        records.decode_frame(record, "here")
+    assert tracemalloc.get_traced_memory()[1] < 5_000_000
+    tracemalloc.stop()
+    for header in ("text", 3, [3], [None], {"a": 1}):
+        with pytest.raises(schema.DataError, match="here: damaged"):
+            records.decode_frame(record_of(header, b""), "here")
+
+
+def test_a_spoilt_entry_of_a_shard_is_written_anew(source, packed):
+    for content in ("", "[]", "[" * 100_000, '{"file": "../x"}', "null"):
+        (packed / "shard-00001.json").write_text(content)
+        assert shards.pack(source, packed, frames_per_shard=5, workers=1)
+        assert len(frames_of(records.PackedRecording(packed))) == 24

@@ -44,6 +44,14 @@ def test_points_on_the_road_do_not_count_above_it():
     np.testing.assert_allclose(distance, [[2.0]])
 
 
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_a_prediction_that_is_not_finite_is_counted_and_not_fatal(value):
+    truth = np.concatenate([range_view((1, 0, 0, 1))] * 2, axis=1)
+    prediction = np.concatenate([range_view((2, 0, 0, 2)), range_view((value, 0, 0, 2))], axis=1)
+    distance = points.frame_chamfer_m(prediction, truth, return_threshold_m=1.0, points=0, seed=(0,))
+    np.testing.assert_array_equal(distance, [[1.0, np.nan]])
+
+
 def test_subsets_are_keyed():
     cloud = np.arange(300.0).reshape(100, 3)
     first = points.keyed_subset(cloud, 10, (0, 1))

@@ -33,7 +33,7 @@ class BraxImagination(Base):
     def reset(self, rng: jax.Array) -> Any:
         key, key_start = jax.random.split(_typed(rng))
         observation, state = self.core.reset(key_start, self._params)
-        metrics = jax.eval_shape(lambda: self.core.step(key, state, jnp.zeros(2), self._params)[1].terms)
+        metrics = jax.eval_shape(lambda: self.core.step(key, state, jnp.zeros(2, jnp.float32), self._params)[1].terms)
         zeros = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), metrics)
         info = {"key": jax.random.key_data(key), "truncation": jnp.float32(0)}
         return _base.State(state, observation, jnp.float32(0), jnp.float32(0), zeros, info)

@@ -9,7 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from muvo_jax.agents import environment as environment_lib
+from muvo_jax.agents import forks
 from muvo_jax.agents.doors import optional
+from muvo_jax.model import checks
 
 gymnasium: Any = optional.need("gymnasium", "gymnasium")
 Functional: Any = optional.need("gymnasium.experimental.functional", "gymnasium").FuncEnv
@@ -61,10 +63,24 @@ class GymnasiumImagination(Env):
         self.core = core
         self.params = params
         self.observation_space, self.action_space = observation_space(core), action_space()
-        self._reset, self._step = jax.jit(core.reset), jax.jit(core.step)
+        self._compile()
         self._state: environment_lib.EnvState | None = None
 
+    def _compile(self):
+        self._reset, self._step = jax.jit(self.core.reset), jax.jit(self.core.step)
+
+    def __getstate__(self):
+        """For processes that spawn: compiled functions are made anew there, arrays travel as NumPy's."""
+        kept = {name: value for name, value in vars(self).items() if name not in ("_reset", "_step")}
+        return kept | {"params": jax.device_get(self.params), "_state": jax.device_get(self._state)}
+
+    def __setstate__(self, kept):
+        self.__dict__.update(kept)
+        self.params = jax.tree.map(jnp.asarray, self.params)
+        self._compile()
+
     def reset(self, *, seed=None, options=None):
+        forks.check("GymnasiumImagination.reset")
         super().reset(seed=seed, options=options)
         observation, self._state = self._reset(self._key(), self.params)
         return jax.device_get(observation), {}
@@ -72,7 +88,10 @@ class GymnasiumImagination(Env):
     def step(self, action):
         if self._state is None:
             raise ValueError("GymnasiumImagination.step before reset.")
-        self._state, transition = self._step(self._key(), self._state, jnp.asarray(action, jnp.float32), self.params)
+        forks.check("GymnasiumImagination.step")
+        action = np.asarray(action, np.float32)
+        checks.finite("GymnasiumImagination.step", action=action)  # what is outside [-1, 1] is clipped
+        self._state, transition = self._step(self._key(), self._state, action, self.params)
         transition = jax.device_get(transition)
         info = {name: float(value) for name, value in transition.terms.items()}
         return (transition.observation, float(transition.reward), bool(transition.terminated),

@@ -6,11 +6,13 @@ import dataclasses
 
 import numpy as np
 
+from muvo_jax.data.fields import TOWN_CLASSES
+
 # What a surface is made of decides its texture; its class follows.
 MATERIALS = ("wall", "roof", "trunk", "leaves", "pole", "lamp", "car_body", "car_cabin", "shadow", "person", "head",
              "hedge")
 WALL, ROOF, TRUNK, LEAVES, POLE, LAMP, CAR_BODY, CAR_CABIN, SHADOW, PERSON, HEAD, HEDGE = range(len(MATERIALS))
-CLASSES = ("sky", "road", "marking", "pavement", "grass", "building", "vegetation", "pole", "vehicle", "pedestrian")
+CLASSES = TOWN_CLASSES
 SKY, ROAD, MARKING, PAVEMENT, GRASS, BUILDING, VEGETATION, POLE_CLASS, VEHICLE, PEDESTRIAN = range(len(CLASSES))
 CLASS_OF_MATERIAL = np.array([BUILDING, BUILDING, VEGETATION, VEGETATION, POLE_CLASS, POLE_CLASS, VEHICLE, VEHICLE,
                               ROAD, PEDESTRIAN, PEDESTRIAN, VEGETATION], np.uint8)

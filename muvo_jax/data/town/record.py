@@ -6,7 +6,6 @@ forked or spawned process it touches neither the devices nor the main module of 
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 import functools
 import hashlib
@@ -16,22 +15,15 @@ import pathlib
 import subprocess
 import sys
 import tempfile
-import types
 from collections.abc import Callable, Iterator
 from typing import IO, NamedTuple, cast
 
 import numpy as np
 
 from muvo_jax import config as config_lib
-from muvo_jax.data import recorder, schema
+from muvo_jax.data import processes, recorder, schema
 from muvo_jax.data.town import driver, settings
 from muvo_jax.data.town.simulator import WEATHER_NAMES, Town, TownState
-
-fcntl: types.ModuleType | None
-try:
-    import fcntl
-except ImportError:  # Windows: there it is up to the user not to record the same town twice at once
-    fcntl = None
 
 # Raised by whatever changes the bytes of a recording, so that old caches are not taken for new ones.
 RECORDING_VERSION = 2
@@ -116,7 +108,7 @@ def record_town(directory: pathlib.Path | str, town_config: settings.TownConfig,
     directory = pathlib.Path(directory)
     planned = jobs(size)
     describe(directory, town_config, tuple(settings.SIZES[size]))
-    with _locked(directory):
+    with processes.locked(directory / ".lock", "recording", wait=True):
         missing = [job for job in planned if not recorder.is_complete(directory, job.split, job.run)]
         total = sum(job.frames for job in planned)
         done = total - sum(job.frames for job in missing)
@@ -149,10 +141,12 @@ def record_run(directory: pathlib.Path, town: Town, job: TownDrive) -> Iterator[
     for _ in range(WARM_UP_FRAMES):
         state = town.step(state, town.expert(state))
     for frame in range(job.frames):
-        seen = town.render(state)
+        seen = dict(town.render(state))
         action = _chosen(town, state, job.restless)
         x_m, y_m, yaw_rad = state.pose
-        writer.write({**seen, "occupancy": town.occupancy(seen), "frame_id": frame,
+        occupancy = town.occupancy(seen)
+        del seen["range_view"]  # the points say the same
+        writer.write({**seen, "occupancy": occupancy, "frame_id": frame,
                       "timestamp_s": round(frame / town.config.contract.rate_hz, 6), "x_m": x_m, "y_m": y_m,
                       "yaw_rad": yaw_rad, "acceleration": action[0], "steering": action[1],
                       "weather": WEATHER_NAMES[int(state.weather)]})
@@ -188,13 +182,13 @@ def _record_in_workers(directory: pathlib.Path, town_config: settings.TownConfig
     root = str(pathlib.Path(__file__).parents[3])
     environment["PYTHONPATH"] = os.pathsep.join(filter(None, [root, os.environ.get("PYTHONPATH")]))
     reports, report_end = os.pipe()
-    processes = []
+    children = []
     with os.fdopen(reports) as lines, tempfile.TemporaryFile("w+") as errors:
         try:
             for index in range(workers):
                 process = subprocess.Popen([sys.executable, "-m", "muvo_jax.data.town.record"], stdin=subprocess.PIPE,
                                            stdout=report_end, stderr=errors, text=True, env=environment)
-                processes.append(process)
+                children.append(process)
                 order = json.dumps({"directory": str(directory), "town": dataclasses.asdict(town_config),
                                     "jobs": missing[index::workers]})
                 with cast(IO[str], process.stdin) as pipe:
@@ -204,24 +198,15 @@ def _record_in_workers(directory: pathlib.Path, town_config: settings.TownConfig
         try:
             for line in lines:
                 yield int(line)
-            failed = [process.wait() for process in processes]
+            failed = [process.wait() for process in children]
         finally:
-            for process in processes:
+            for process in children:
                 process.terminate()
                 process.wait()
         if any(failed):
             errors.seek(0)
             raise RuntimeError(f"recording the town into {directory} failed (exit codes {failed}):\n"
                                f"{errors.read()[-2000:]}")
-
-
-@contextlib.contextmanager
-def _locked(directory: pathlib.Path) -> Iterator[None]:
-    """Lets one process at a time record into a directory; the lock ends with the process, however it ends."""
-    with (directory / ".lock").open("w") as lock:
-        if fcntl is not None:
-            fcntl.flock(lock, fcntl.LOCK_EX)
-        yield
 
 
 def _work() -> None:

@@ -9,8 +9,11 @@ from typing import Annotated
 
 import tyro
 
-from muvo_jax import command_line
-from muvo_jax.interop.parity import registry, runner
+from muvo_jax import command_line, late
+
+with late.imports():
+    from muvo_jax.interop.parity import registry, runner
+    from muvo_jax.training import screen
 
 
 @dataclasses.dataclass(frozen=True)
@@ -35,20 +38,19 @@ python -m muvo_jax.interop.parity PACKS --only=p1,p3
 """
 
 
+def compare(options: Options, show: screen.Screen) -> runner.Report:
+    """Does what the command line asks for."""
+    only = [name for name in options.only.lower().split(",") if name]
+    report = runner.run_folder(options.folder, registry.FILES, only=only, recordings=options.recordings,
+                               write=show.line)
+    for line in report.lines():
+        show.line(line)
+    return report
+
+
 def main() -> int:
-    """Returns the exit code."""
-    outcome = []
-
-    def work(options: Options, show) -> None:
-        only = [name for name in options.only.lower().split(",") if name]
-        report = runner.run_folder(options.folder, registry.FILES, only=only, recordings=options.recordings,
-                                   write=lambda line: print(line, flush=True))
-        for line in report.lines():
-            print(line)
-        outcome.append(report.ok)
-
-    code = command_line.run(Options, work, program="interop.parity", examples=_EXAMPLES)
-    return code or int(not all(outcome))
+    return command_line.run(Options, compare, program="interop.parity", examples=_EXAMPLES,
+                            status=lambda report: int(not report.ok))
 
 
 if __name__ == "__main__":

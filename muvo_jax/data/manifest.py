@@ -1,0 +1,140 @@
+"""The manifest of a packed recording: what it holds, which shards it has, and whether they are whole."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import json
+import pathlib
+from typing import Any
+
+from muvo_jax import config as config_lib
+from muvo_jax.data import description as description_lib
+from muvo_jax.data import files, schema
+
+SCHEMA_VERSION = 1
+MANIFEST_FILE = "manifest.json"
+FRAMES_PER_SHARD = 256  # where nothing else is said
+# What values that are anything at all can lead to.
+_MALFORMED = (ValueError, KeyError, TypeError, AttributeError, OverflowError, RecursionError, MemoryError)
+
+
+def read_manifest(root: pathlib.Path) -> dict:
+    """The manifest of a packed recording.
+
+    Raises:
+      DataError: where it is missing, of another version or malformed.
+    """
+    path = root / MANIFEST_FILE
+    try:
+        manifest = json.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError as error:
+        raise files.missing(path, "the manifest of a packed recording (pack it to the end)") from error
+    except (ValueError, RecursionError) as error:
+        raise schema.DataError(f"{path}: not valid JSON ({error}). Pack the recording again.") from error
+    version = manifest.get("schema_version") if isinstance(manifest, dict) else None
+    if version != SCHEMA_VERSION:
+        raise schema.DataError(f"{path}: schema_version is {version!r}, this reader knows {SCHEMA_VERSION}. Pack the "
+                               f"recording again, or use the muvo_jax that wrote it.")
+    lacking = [name for name in ("shards", "frames_per_shard", "sequences", "description") if name not in manifest]
+    if lacking:
+        raise schema.DataError(f"{path}: {', '.join(lacking)} missing. Pack the recording again.")
+    fault = _manifest_fault(manifest)
+    if fault:
+        raise schema.DataError(f"{path}: {fault}. Pack the recording again.")
+    return manifest
+
+
+def _manifest_fault(manifest: dict) -> str | None:
+    """What contradicts itself in a manifest or is of another type; None where nothing does."""
+    per_shard, shards, sequences = (manifest[name] for name in ("frames_per_shard", "shards", "sequences"))
+    if not is_count(per_shard, least=1):
+        return f"frames_per_shard is {str(per_shard)[:80]}, expected a whole number of 1 or more"
+    for name, entries, fault in (("shards", shards, entry_fault), ("sequences", sequences, _sequence_fault)):
+        if not isinstance(entries, list):
+            return f"{name} is no list"
+        for number, entry in enumerate(entries):
+            if said := fault(entry):
+                return f"{name}[{number}]: {said}"
+    total = sum(sequence["length"] for sequence in sequences)
+    frames = [min(per_shard, total - number * per_shard) for number in range(len(shards))]
+    if [shard["frames"] for shard in shards] != frames or sum(frames) != total:
+        return (f"{len(shards)} shards of {per_shard} frames with {sum(shard['frames'] for shard in shards)} in all do "
+                f"not hold the {total} frames of the sequences")
+    starts = [(sequence["name"], sequence["start"]) for sequence in sequences]
+    return "two sequences of one run begin at one frame" if len(set(starts)) < len(starts) else None
+
+
+def entry_fault(entry: Any) -> str | None:
+    """What is wrong with what a shard says about itself; None where it can be used."""
+    if not isinstance(entry, dict):
+        return "no table"
+    name = entry.get("file")
+    if not isinstance(name, str) or pathlib.PurePosixPath(name).name != name or "\0" in name or "\\" in name:
+        return f"file is {str(name)[:80]!r}, expected the name of a file"
+    for field in ("frames", "bytes"):
+        if not is_count(entry.get(field), least=1):
+            return f"{field} is {str(entry.get(field))[:80]}, expected a whole number of 1 or more"
+    if entry["frames"] > entry["bytes"]:
+        return f"{entry['frames']} frames in {entry['bytes']} bytes"
+    return None if isinstance(entry.get("sha256"), str) else "sha256 is no text"
+
+
+def _sequence_fault(sequence: Any) -> str | None:
+    if not isinstance(sequence, dict) or set(sequence) != {"split", "name", "start", "length"}:
+        return "expected split, name, start and length"
+    if not (isinstance(sequence["split"], str) and isinstance(sequence["name"], str)):
+        return "split and name must be text"
+    if not (is_count(sequence["start"]) and is_count(sequence["length"], least=1)):
+        return f"start {str(sequence['start'])[:80]} and length {str(sequence['length'])[:80]} must be whole numbers"
+    return None
+
+
+def is_count(value: Any, least: int = 0) -> bool:
+    """Whether a value from a file is a whole number of at least `least`, and none that overflows."""
+    return type(value) is int and least <= value < 2**62
+
+
+def shard_fault(root: pathlib.Path, shard: dict, *, checksum: bool) -> str | None:
+    """What is wrong with a shard, given its entry in the manifest; None where nothing is."""
+    path = root / shard["file"]
+    if not path.is_file():
+        return "it is missing"
+    size = path.stat().st_size
+    if size != shard["bytes"]:
+        return f"it has {size} bytes, not {shard['bytes']}"
+    if checksum and file_sha256(path) != shard["sha256"]:
+        return "its checksum does not fit"
+    return None
+
+
+def file_sha256(path: pathlib.Path) -> str:
+    """Hexadecimal SHA-256 of a file, read in pieces."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def describe(description: schema.RecordingDescription) -> dict:
+    """The JSON form of a description, without its kind."""
+    values = dataclasses.asdict(description)
+    values["modalities"] = sorted(description.modalities)
+    return values
+
+
+def read_description(manifest: dict, path: pathlib.Path) -> schema.RecordingDescription:
+    """The inverse of `describe`; `path` of the manifest is for messages.
+
+    Raises:
+      DataError: where it is malformed.
+    """
+    try:
+        values = dict(manifest["description"])
+        sections = {name: description_lib.section({name: values[name]} if values.get(name) else {}, name, path,
+                                                  required=False) for name in ("camera", "lidar", "voxels")}
+        contract = config_lib.parse(config_lib.ActionContract, values["contract"], f"{path}: contract")
+        return schema.RecordingDescription(
+            name=values["name"], kind=f"packed {values['kind']}", rate_hz=values["rate_hz"], contract=contract,
+            modalities=frozenset(values["modalities"]), splits=tuple(values["splits"]), notes=tuple(values["notes"]),
+            classes=tuple(values.get("classes", ())), **sections)
+    except _MALFORMED as error:
+        raise schema.DataError(f"{path}: description is malformed ({error}). Pack the recording again.") from error

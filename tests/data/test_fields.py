@@ -1,0 +1,132 @@
+"""The table of fields: RawFrame and types.Batch agree with it, and what is read can be written and read again."""
+
+import typing
+
+import numpy as np
+import pytest
+import recording_writers as writers
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as arrays
+
+from muvo_jax import config as config_lib
+from muvo_jax import types
+from muvo_jax.data import fields, kitti, plain, recorder, records, schema, shards
+
+SIZES = {"H": 6, "W": 9, "N": 7, "X": 4, "Y": 5, "Z": 3}
+CLASSES = (*(f"class {number}" for number in range(20)), "vehicle")
+GRID = config_lib.VoxelGrid((4, 5, 3), 1.0, (-2.0, -2.5, -1.0))
+LIDAR = config_lib.RangeViewGeometry(rows=4, columns=8)
+CAMERA = schema.Camera(9, 6, ((5.1, 0.0, 4.5), (0.0, 5.1, 3.0), (0.0, 0.0, 1.0)),
+                       ((0.0, 0.0, 1.0, 1.5), (-1.0, 0.0, 0.0, 0.1), (0.0, -1.0, 0.0, 1.6), (0.0, 0.0, 0.0, 1.0)))
+WRITTEN = [field for field in fields.TABLE if field.name not in ("intrinsics", "camera_to_ego", "image_instance_mask",
+                                                                  "frame_id", "timestamp_s")]
+
+
+def numbers_of(field):
+    """Any numbers that the field may have, its extremes included."""
+    dtype = np.dtype(field.dtype)
+    if field.values:
+        return st.sampled_from([dtype.type(value) for value in field.values])
+    if field.name in ("image_classes", "point_classes"):
+        return st.sampled_from([np.uint8(value) for value in (*range(len(CLASSES)), fields.UNKNOWN)])
+    if dtype.kind in "iu":
+        info = np.iinfo(dtype)
+        return st.integers(max(info.min, int(max(field.limits.lowest, info.min))),
+                           int(min(field.limits.highest, info.max)))
+    width = 8 * dtype.itemsize
+    low, high = (max(min(value, 1e30), -1e30) for value in (field.limits.lowest, field.limits.highest))
+    low, high = np.nextafter(dtype.type(low), dtype.type(0)), np.nextafter(dtype.type(high), dtype.type(0))
+    return st.floats(float(max(low, 0.0) if field.name == "depth_m" else low), float(high), width=width)
+
+
+@st.composite
+def frames(draw):
+    """One frame of all fields that a writer takes, as a reader would give it."""
+    frame = {"frame_id": np.int64(draw(st.integers(0, 2**63 - 1))),
+             "timestamp_s": np.float64(draw(st.floats(0.0, 1e10)))}
+    for field in WRITTEN:
+        shape = tuple(SIZES.get(size, size) for size in field.shape)
+        values = draw(arrays.arrays(field.dtype, shape, elements=numbers_of(field)))
+        frame[field.name] = values if shape else field.dtype(values[()])
+    if draw(st.booleans()):
+        frame["depth_m"] = plain.decode_depth(recorder.encode_depth(frame["depth_m"]))
+        frame["depth_m"][0, 0] = np.inf
+    return frame
+
+
+def assert_same(read, written):
+    for name, value in written.items():
+        assert np.asarray(read[name]).dtype == np.asarray(value).dtype, name
+        np.testing.assert_array_equal(np.asarray(read[name]).view(np.uint8) if np.ndim(value) else read[name],
+                                      np.asarray(value).view(np.uint8) if np.ndim(value) else value, err_msg=name)
+
+
+def copy(root, written, described=None):
+    """The frames as a plain recording, opened."""
+    camera, lidar, voxels = (CAMERA, LIDAR, GRID) if described is None else (described.camera, described.lidar,
+                                                                            described.voxels)
+    recorder.write_description(root, name="copy", rate_hz=10.0, splits=("train",), camera=camera, lidar=lidar,
+                               voxels=voxels, classes=CLASSES,
+                               contract=config_lib.ActionContract() if described is None else described.contract)
+    writer = recorder.RunWriter(root, "train", "a")
+    for frame in written:
+        writer.write(frame)
+    writer.close()
+    return plain.PlainRecording(root, labels=fields.LABELS)
+
+
+def test_raw_frames_and_batches_follow_the_table():
+    assert set(fields.FIELDS) == set(typing.get_type_hints(schema.RawFrame))
+    assert fields.LABELS == schema.LABELS
+    for name, (dtype, rank) in types.BATCH_FIELDS.items():
+        field = fields.FIELDS.get(name)
+        if field is not None:
+            assert dtype == field.dtype, name
+            assert rank == len(field.shape) + (1 if name in types.UNTIMED_FIELDS else 2), name
+    for field in fields.TABLE:  # each lies in one place: a folder, columns, or the description
+        assert bool(field.folder) + bool(field.columns) == (field.name not in ("intrinsics", "camera_to_ego"))
+        assert bool(field.array) == (".npz" in field.suffixes)
+
+
+@settings(max_examples=25, deadline=None)
+@given(frame=frames())
+def test_every_field_is_written_and_read_bit_for_bit(tmp_path_factory, frame):
+    root = tmp_path_factory.mktemp("copies")
+    first = copy(root / "once", [frame])
+    read = first.read(first.sequences[0], 0)
+    assert_same(read, frame)
+    second = copy(root / "twice", [read])
+    assert_same(second.read(second.sequences[0], 0), read)
+    assert_same(records.decode_frame(records.encode_frame(read, records.Encoding()), "memory"), read)
+
+
+def test_kitti_and_packs_are_copied_bit_for_bit(tmp_path):
+    sources_ = {"kitti": kitti.KittiRecording(writers.write_kitti(tmp_path / "kitti"))}
+    shards.pack(writers.write_plain(tmp_path / "plain"), tmp_path / "packed", workers=1)
+    sources_["packed"] = records.PackedRecording(tmp_path / "packed")
+    for name, source in sources_.items():
+        sequence = source.sequences[0]
+        written = [source.read(sequence, index) for index in range(sequence.length)]
+        again = copy(tmp_path / f"copy of {name}", written, source.description)
+        assert again.sequences[0].length == sequence.length
+        for index, frame in enumerate(written):
+            assert_same(again.read(again.sequences[0], index), frame)
+
+
+@pytest.mark.parametrize("field", [field for field in fields.TABLE
+                                   if field.limits is not fields.FINITE or field.values], ids=lambda field: field.name)
+def test_no_field_takes_a_number_that_it_cannot_have(field):
+    shape = tuple(SIZES.get(size, size) for size in field.shape)
+    good = np.zeros(shape, field.dtype)
+    assert fields.conform(field.name, good, "here").dtype == field.dtype
+    wrong = [7] if field.values else [value for value, whole in (
+        (field.limits.lowest - 1, True), (field.limits.highest * 2 + 1, field.limits.highest < 2**62)) if
+        np.isfinite(value) and whole]
+    for value in wrong:
+        bad = np.full(shape, value, np.float64 if np.dtype(field.dtype).kind == "f" else np.int64)
+        with pytest.raises(schema.DataError, match=rf"here: {field.name} has \d+ of \d+ values such as"):
+            fields.conform(field.name, bad, "here")
+    if np.dtype(field.dtype).kind == "f" and field.finite:
+        with pytest.raises(schema.DataError, match="values such as nan"):
+            fields.conform(field.name, np.full(shape, np.nan), "here")

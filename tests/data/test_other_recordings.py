@@ -1,0 +1,406 @@
+"""Recordings of other people's kinds: what is found, what is refused by name; what a run lacks takes nothing away."""
+
+import shutil
+import warnings
+
+import numpy as np
+import pytest
+import recording_writers as writers
+from PIL import Image
+
+from muvo_jax import config as config_lib
+from muvo_jax import presets
+from muvo_jax.data import fields, files, kitti, pipeline, plain, prepare, recorder, schema, sources, windows
+
+
+def rewrite_table(folder, change):
+    path = folder / "frames.csv"
+    path.write_bytes(change(path.read_text()).encode())
+
+
+def pieces(recording):
+    return [(sequence.name, sequence.start, sequence.length) for sequence in recording.sequences]
+
+
+def with_cell(column, row, value):
+    """Changes one cell of a table as recording_writers makes it; row 0 is the first frame."""
+    def change(text):
+        header, *lines = text.splitlines()
+        cells = lines[row].split(",")
+        cells[header.split(",").index(column)] = value
+        lines[row] = ",".join(cells)
+        return "\n".join([header, *lines]) + "\n"
+    return change
+
+
+@pytest.mark.parametrize("change", [
+    lambda text: "\ufeff" + text,
+    lambda text: text.replace(",", ", "),
+    lambda text: text.replace("\n", "\r\n"),
+    lambda text: text + "\n,,,,,,,,,,\n\n",
+    lambda text: text.replace("frame_id", " frame_id "),
+    with_cell("is_terminal", 0, ""), with_cell("is_terminal", 0, "False"), with_cell("frame_id", 3, "3.0"),
+], ids=["byte order mark", "spaces", "Windows lines", "blank lines", "blank in header", "blank flag", "word", "12.0"])
+def test_tables_as_other_programs_write_them(tmp_path, change):
+    root = writers.write_plain(tmp_path)
+    before = pieces(plain.PlainRecording(root))
+    rewrite_table(root / "train/a", change)
+    assert pieces(plain.PlainRecording(root)) == before
+
+
+@pytest.mark.parametrize(("change", "message"), [
+    (with_cell("speed_mps", 3, "900"), r"line 5: speed_mps is 900; it must be at least -100 and at most 150 m/s"),
+    (with_cell("steering", 0, "-1.5"), r"line 2: steering is -1.5; it must be at least -1.001 and at most 1.001"),
+    (with_cell("acceleration", 0, "inf"), r"line 2: acceleration is 'inf', expected a finite number"),
+    (with_cell("is_terminal", 1, "2"), r"line 3: is_terminal is 2; it must be one of 0, 1"),
+    (with_cell("reward", 0, ""), r"line 2: reward is '', expected a finite number"),
+    (with_cell("x_m", 4, "nan"), r"line 6: x_m is 'nan', expected a finite number"),
+    (with_cell("frame_id", 2, "1"), r"line 4: frame_id is 1, which is there already .*line 3"),
+    (with_cell("frame_id", 2, "-7"), r"line 4: frame_id is '-7', expected a whole number from 0"),
+    (with_cell("frame_id", 2, "2.5"), r"line 4: frame_id is '2.5', expected a whole number"),
+    (with_cell("frame_id", 2, str(2**63)), r"line 4: frame_id is '9223372036854775808'"),
+    (lambda text: text.replace(",", ";"), r"Cells are separated by ';'; write commas"),
+    (lambda text: text.replace("reward", "speed_mps"), r"column speed_mps is there twice"),
+    (lambda text: text.replace("0.25", "0,25", 1), r"line 2: 12 cells under 11 columns. Numbers have a point"),
+])
+def test_tables_that_cannot_be_are_refused_by_line_column_value_and_range(tmp_path, change, message):
+    root = writers.write_plain(tmp_path)
+    rewrite_table(root / "train/a", change)
+    with pytest.raises(schema.DataError, match=f"frames.csv.*{message}"):
+        plain.PlainRecording(root)
+
+
+@pytest.mark.parametrize("first", [1_700_000_000_100_000_001, 2**53, 2**63 - 20])
+def test_whole_numbers_stay_whole(tmp_path, first):
+    root = writers.write_plain(tmp_path, {"train/a": 6})
+    folder = root / "train/a"
+    for number in range(6):
+        for path in folder.glob(f"*/{number:06d}.*"):
+            path.rename(path.with_name(f"{first + number}{path.suffix}"))
+        rewrite_table(folder, with_cell("frame_id", number, str(first + number)))
+    recording = plain.PlainRecording(root)
+    (sequence,) = recording.sequences
+    for index in range(6):
+        frame = recording.read(sequence, index)
+        assert frame["frame_id"] == first + index and (frame["image"] == index).all()
+
+
+def rename_images(folder, name):
+    for path in (folder / "image").iterdir():
+        path.rename(path.with_name(name(int(path.stem))))
+
+
+@pytest.mark.parametrize("name", [lambda k: f"{k}.png", lambda k: f"{k:012d}.png", lambda k: f"{k:06d}.PNG"])
+def test_files_are_found_under_other_paddings_and_cases(tmp_path, name):
+    root = writers.write_plain(tmp_path)
+    rename_images(root / "train/a", name)
+    (root / "train/a/image/.DS_Store").touch()
+    (root / "train/a/image/Thumbs.db").touch()
+    recording = plain.PlainRecording(root)
+    assert pieces(recording)[0] == ("train/a", 0, 10)
+    assert (recording.read(recording.sequences[0], 7)["image"] == 7).all()
+
+
+def test_files_that_no_frame_can_be_told_of_are_refused(tmp_path):
+    root = writers.write_plain(tmp_path)
+    rename_images(root / "train/a", lambda k: f"frame_{k}.png")
+    with pytest.raises(schema.DataError, match=r"no file is named by the number of its frame.* found frame_0.png"):
+        plain.PlainRecording(root)
+    rename = root / "train/b/image"
+    for path in (root / "train/a/image").iterdir():
+        path.unlink()
+    (rename / "3.png").write_bytes((rename / "000003.png").read_bytes())
+    with pytest.raises(schema.DataError, match=r"000003.png and 3.png are both frame 3. Remove one"):
+        plain.PlainRecording(root)
+
+
+def save(path, pixels, **options):
+    Image.fromarray(pixels).save(path, **options)
+
+
+@pytest.mark.parametrize(("name", "pixels", "message"), [
+    ("image", np.zeros((32, 64), np.uint16), r"mode 'I;16', expected 8 bits of each colour"),
+    ("image", np.zeros((32, 64), np.float32), None),  # a TIFF that is named like a PNG
+    ("route_map", np.zeros((64, 64), np.uint16), r"expected 8 bits of each colour"),
+    ("route_map", np.random.default_rng(0).integers(0, 255, (64, 64, 3), np.uint8), r"expected grey"),
+    ("route_map", np.zeros((32, 32), np.uint8), r"shape \[32, 32\] of route_map, expected \[64, 64\]"),
+    ("depth", np.full((32, 64), 200, np.uint8), r"mode 'L', expected 16 bits of grey, the depth in centimetres"),
+    ("depth", np.zeros((32, 64, 3), np.uint8), r"expected 16 bits of grey"),
+    ("classes", np.full((32, 64), 37, np.uint8), r"image_classes has the class 37, but the recording names only 10"),
+    ("classes", np.random.default_rng(0).integers(0, 9, (32, 64, 3), np.uint8), r"the number of a class in each pixel"),
+    ("classes", np.full((32, 64), 300, np.uint16), r"expected 8 bits"),
+])
+def test_pictures_of_other_pixels_are_refused(tmp_path, name, pixels, message):
+    root = writers.write_plain(tmp_path, {"train/a": 4})
+    folder = root / "train/a" / name
+    folder.mkdir(exist_ok=True)
+    for number in range(4):
+        path = folder / f"{number:06d}.png"
+        if message is None:
+            path = path.with_suffix(".png")
+            Image.fromarray(pixels).save(path, format="TIFF")
+        else:
+            save(path, pixels)
+    labels = frozenset({"depth_m", "image_classes"})
+    with pytest.raises(schema.DataError, match=message or "expected 8 bits"):
+        recording = plain.PlainRecording(root, labels=labels)
+        recording.read(recording.sequences[0], 0)
+
+
+def test_pictures_that_say_the_same_otherwise_are_read(tmp_path):
+    grey = np.arange(64 * 64, dtype=np.uint32).reshape(64, 64).astype(np.uint8)
+    for name, image in {"grey": Image.fromarray(grey), "colours": Image.fromarray(np.stack([grey] * 3, axis=-1)),
+                        "alpha": Image.fromarray(grey).convert("LA")}.items():
+        image.save(tmp_path / f"{name}.png")
+        np.testing.assert_array_equal(files.read_image(tmp_path / f"{name}.png", "L"), grey)
+    palette = Image.fromarray(grey % 5)
+    palette.putpalette([200, 10, 10, 10, 200, 10, 10, 10, 200, 0, 0, 0, 255, 255, 255])
+    palette.save(tmp_path / "palette.png")
+    np.testing.assert_array_equal(files.read_image(tmp_path / "palette.png", "classes"), grey % 5)
+    rgba = Image.fromarray(np.dstack([grey, grey, grey, np.full_like(grey, 7)]))
+    rgba.save(tmp_path / "rgba.png")
+    np.testing.assert_array_equal(files.read_image(tmp_path / "rgba.png", "RGB"), np.stack([grey] * 3, axis=-1))
+
+
+@pytest.mark.parametrize("orientation", range(1, 9))
+def test_pictures_are_turned_as_the_camera_was_held(tmp_path, orientation):
+    upright = np.zeros((16, 32, 3), np.uint8)
+    upright[:8, :16] = 255
+    turned = {1: upright, 2: upright[:, ::-1], 3: upright[::-1, ::-1], 4: upright[::-1],
+              5: upright.transpose(1, 0, 2), 6: upright[:, ::-1].transpose(1, 0, 2)[:, :, :],
+              7: upright[::-1, ::-1].transpose(1, 0, 2), 8: upright[::-1].transpose(1, 0, 2)}
+    stored = {6: np.rot90(upright), 8: np.rot90(upright, -1)}.get(orientation, turned[orientation])
+    exif = Image.Exif()
+    exif[0x0112] = orientation
+    Image.fromarray(np.ascontiguousarray(stored)).save(tmp_path / "a.jpg", exif=exif, quality=100)
+    np.testing.assert_allclose(files.read_image(tmp_path / "a.jpg", "RGB"), upright, atol=12)
+
+
+@pytest.mark.parametrize(("file", "name", "values", "message"), [
+    ("occupancy", "occupancy", np.full((16, 16, 16), 7, np.uint8), r"4096 of 4096 values such as 7; expected one of 0"),
+    ("occupancy", "occupancy", np.full((16, 16, 16), 0.5), r"occupancy holds float64, expected uint8"),
+    ("occupancy", "occupancy", np.full((16, 16, 16), 256), r"values such as 256; expected one of 0, 1, 255"),
+    ("lidar", "points_m", np.full((5, 3), 8_000_000.0), r"points_m has 15 of 15 values such as 8000000.0"),
+    ("lidar", "points_m", np.full((5, 3), 2500), r"points_m holds int64, expected float32 in m"),
+    ("lidar", "points_m", np.full((5, 4), 1.0), r"shape \[5, 4\] of points_m"),
+])
+def test_arrays_that_cannot_be_are_refused(tmp_path, file, name, values, message):
+    root = writers.write_plain(tmp_path, {"train/a": 4})
+    np.savez(root / f"train/a/{file}/000000.npz", **{name: values})
+    recording = plain.PlainRecording(root)
+    with pytest.raises(schema.DataError, match=message):
+        recording.read(recording.sequences[0], 0)
+
+
+def test_a_folder_that_one_run_has_more_takes_no_frame_from_the_others(tmp_path):
+    root = writers.write_plain(tmp_path, {"train/a": 10, "train/b": 10, "train/c": 10, "val_rl/d": 10})
+    before = pieces(plain.PlainRecording(root))
+    (root / "train/a/depth").mkdir()  # empty
+    assert pieces(plain.PlainRecording(root, labels=frozenset({"depth_m"}))) == before
+    for number in range(10):
+        save(root / f"train/a/depth/{number:06d}.png", np.full((32, 64), 100, np.uint16))
+    with pytest.warns(schema.DataWarning, match=r"depth_m is recorded in 1 of 4 runs \(train/a\) only and is not used"):
+        recording = plain.PlainRecording(root, labels=frozenset({"depth_m"}))
+    assert pieces(recording) == before and "depth_m" not in recording.description.modalities
+
+
+@pytest.mark.parametrize("empty", [True, False])
+def test_a_run_without_a_sensor_is_passed_by_only_where_it_is_needed(tmp_path, empty):
+    root = writers.write_plain(tmp_path, {"train/a": 10, "train/b": 10, "train/c": 10, "val_rl/d": 10})
+    for path in (root / "train/b/lidar").iterdir():
+        path.unlink()
+    if not empty:
+        (root / "train/b/lidar").rmdir()
+    with pytest.warns(schema.DataWarning, match=r"points_m is missing in 1 of 4 runs \(train/b\)"):
+        recording = plain.PlainRecording(root)
+    assert [sequence.lacks for sequence in recording.sequences] == [(), ("points_m",), (), ()]
+    assert "points_m" not in recording.read(recording.sequences[1], 0)
+    config = config_lib.override_all(presets.tiny(), {"data.stride": 1})
+    adapted = prepare.adapt(config, recording).config
+    blind = prepare.adapt(config_lib.override_all(config, {"model.lidar": "none", "model.heads": ["image", "action"]}),
+                          recording).config
+    names = {}
+    for what, chosen in (("both", adapted), ("camera alone", blind)):
+        needs = pipeline.Frames(recording, chosen).needs
+        found = windows.find_windows(recording, "train", frames=4, stride=1, needs=needs)
+        names[what] = {window.sequence.name for window in found}
+    assert names == {"both": {"train/a", "train/c"}, "camera alone": {"train/a", "train/b", "train/c"}}
+
+
+def test_a_split_that_lacks_what_is_needed_is_said_so(tmp_path):
+    root = writers.write_plain(tmp_path, {"train/a": 10, "train/b": 10, "val_rl/d": 10})
+    for path in (root / "val_rl/d/image").iterdir():
+        path.unlink()
+    with pytest.warns(schema.DataWarning, match="image is missing in 1 of 3 runs"):
+        recording = plain.PlainRecording(root)
+    config = config_lib.override_all(presets.tiny(), {"data.stride": 1})
+    with pytest.raises(schema.DataError, match=r"split 'val_rl' that has image has 0 frames, but a window needs 8"):
+        prepare.adapt(config, recording)
+
+
+@pytest.mark.parametrize("column", ["reward", "is_terminal", "x_m"])
+def test_a_column_that_one_run_lacks_is_not_switched_off_for_the_others(tmp_path, column):
+    root = writers.write_plain(tmp_path, {"train/a": 10, "train/b": 10, "train/c": 10, "val_rl/d": 10})
+    rewrite_table(root / "train/a", with_cell("is_terminal", 4, "1"))
+    for run in ("train/b",):
+        rewrite_table(root / run, lambda text: text.replace(column, f"other_{column}"))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", schema.DataWarning)
+        recording = plain.PlainRecording(root)
+    assert pieces(recording)[:2] == [("train/a", 0, 5), ("train/a", 5, 5)]
+    field = fields.COLUMNS[column].name
+    assert field in recording.description.modalities
+    frame = recording.read(recording.sequences[2], 0)
+    assert recording.sequences[2].name == "train/b" and (field in frame) == (column == "is_terminal")
+    config = config_lib.override_all(presets.tiny(), {"data.stride": 1})
+    frames = pipeline.Frames(recording, prepare.adapt(config, recording).config)
+    batch = frames.batch([windows.Window(sequence, 0, 4, 1) for sequence in recording.sequences[1:4]])
+    assert (batch.reward is None) == (column == "reward") and batch.is_terminal is not None
+
+
+@pytest.mark.parametrize(("changes", "message"), [
+    ({"rate_hz": "0"}, "rate_hz is 0.0; it must be above 0"),
+    ({"rate_hz": "nan"}, "rate_hz is nan"),
+    ({"rate_hz": "true"}, "rate_hz is True, expected a number"),
+    ({"splits": '["train", "train"]'}, "splits is .*expected a list of different names"),
+    ({"splits": "[1]"}, "splits is .*expected a list of different names"),
+    ({"width_px": "0"}, "camera.width_px is 0; it must be at least 1"),
+    ({"width_px": "true"}, "camera.width_px: got True, expected int"),
+    ({"height_px": '"32"'}, "camera.height_px: got '32', expected int"),
+    ({"intrinsics": "[[nan, 0, 32], [0, 32, 16], [0, 0, 1]]"}, "camera.intrinsics is .*it must be finite"),
+    ({"intrinsics": "[[0, 0, 32], [0, 32, 16], [0, 0, 1]]"}, "camera.intrinsics have fx = 0 for 64 pixels"),
+    ({"intrinsics": "[[0.5, 0, 0.5], [0, 0.5, 0.5], [0, 0, 1]]"}, "camera.intrinsics have fx = 0.5 for 64 pixels"),
+    ({"intrinsics": "[[32, 0, 32000], [0, 32, 16], [0, 0, 1]]"}, "camera.intrinsics have cx = 32000"),
+    ({"intrinsics": "[[32, 0, 32], [0, 32, 16], [0, 0, 0]]"}, r"camera.intrinsics are .*\[0, 0, 1\]\] in pixels"),
+    ({"camera_to_ego": "[[0, 0, 2, 1], [-1, 0, 0, 0], [0, -1, 0, 2], [0, 0, 0, 1]]"}, "camera_to_ego is .*a rotation"),
+    ({"camera_to_ego": "[[0, 0, 1, 1500], [-1, 0, 0, 0], [0, -1, 0, 1600], [0, 0, 0, 1]]"},
+     r"camera_to_ego puts the camera at \[1500.0, 0.0, 1600.0\]; each coordinate must be .* m"),
+    ({"camera_to_ego": "[[0, 0, 1, 1], [1, 0, 0, 0], [0, -1, 0, 2], [0, 0, 0, 1]]"}, "camera_to_ego is .*a rotation"),
+    ({"elevation_min_rad": "-25.0"}, "lidar.elevation_min_rad is -25.0; it must be .* rad"),
+    ({"elevation_min_rad": "0.4"}, "lidar.elevation_min_rad is 0.4; it must be below elevation_max_rad, 0.1"),
+    ({"rows": "0"}, "lidar.rows is 0"),
+    ({"rows": "64.5"}, "lidar.rows: got 64.5, expected int"),
+    ({"position_m": "[0.5, 0, 2000]"}, r"lidar.position_m is .*; it must be at least -30 and at most 30 m"),
+    ({"voxel_size_m": "-1"}, "voxels.voxel_size_m is -1.0; it must be above 0"),
+    ({"shape": "[16, 0, 16]"}, "voxels.shape is .*at least 1"),
+    ({"accel_full_mps2": "0"}, "action.accel_full_mps2 is 0.0; it must be above 0"),
+    ({"source": '"measured"'}, "action.source: 'measured' is unknown"),
+])
+def test_descriptions_that_cannot_be_are_refused_by_name(tmp_path, changes, message):
+    with pytest.raises(schema.DataError, match=f"recording.toml.*{message}"):
+        plain.PlainRecording(writers.write_plain(tmp_path, {"train/a": 2}, **changes))
+
+
+def test_one_rate_is_said_once(tmp_path):
+    root = writers.write_plain(tmp_path, {"train/a": 30}, rate_hz="20")
+    assert plain.PlainRecording(root).description.contract.rate_hz == 20.0  # the section does not say one
+    path = root / "recording.toml"
+    path.write_text(path.read_text().replace("[action]\n", "[action]\nrate_hz = 10.0\n"))
+    with pytest.raises(schema.DataError, match=r"rate_hz is 20, but action.rate_hz is 10: a step would last two times"):
+        plain.PlainRecording(root)
+
+
+def test_a_description_with_a_byte_order_mark_and_one_with_a_slip(tmp_path):
+    root = writers.write_plain(tmp_path, {"train/a": 2})
+    path = root / "recording.toml"
+    text = path.read_text()
+    path.write_text("\ufeff" + text, encoding="utf-8")
+    assert plain.PlainRecording(root).description.name == "test"
+    path.write_text(text.replace("[voxels]", "[voxel]"))
+    with pytest.raises(schema.DataError, match=r"'voxel' is unknown. Did you mean voxels\?"):
+        plain.PlainRecording(root)
+
+
+def test_route_maps_have_the_scale_that_the_recording_says(tmp_path):
+    root = writers.write_plain(tmp_path, {"train/a": 30, "val_rl/b": 30})
+    assert plain.PlainRecording(root).description.route_map == config_lib.RouteMap()
+    with (root / "recording.toml").open("a") as file:
+        file.write("[route_map]\nmetres_per_px = 0.5\nego_row = 60\n")
+    config = prepare.adapt(presets.tiny(), plain.PlainRecording(root)).config
+    assert config.data.route_map == config_lib.RouteMap(0.5, 60.0, 32.0)
+
+
+def test_the_writer_refuses_slips_and_numbers_that_cannot_be(tmp_path):
+    frame = {"frame_id": 0, "timestamp_s": 0.0, "speed_mps": 1.0, "acceleration": 0.0, "steering": 0.0}
+    writer = recorder.RunWriter(tmp_path, "train", "a")
+    with pytest.raises(ValueError, match=r"'speed_mp' is unknown.* Did you mean speed_mps\?"):
+        writer.write(frame | {"speed_mp": 3.0})
+    with pytest.raises(schema.DataError, match=r"frame 0: steering is 35; it must be"):
+        writer.write(frame | {"steering": 35})
+    with pytest.raises(schema.DataError, match="occupancy has 8 of 8 values such as 3; expected one of 0, 1, 255"):
+        writer.write(frame | {"occupancy": np.full((2, 2, 2), 3, np.uint8)})
+    with pytest.raises(schema.DataError, match=r"points_m holds int64, expected float32 in m"):
+        writer.write(frame | {"points_m": np.zeros((3, 3), np.int64)})
+
+
+def test_home_folders_are_expanded(tmp_path, monkeypatch):
+    monkeypatch.setenv("HOME", str(tmp_path))
+    writers.write_plain(tmp_path / "rec", {"train/a": 2})
+    drive = writers.write_kitti(tmp_path / "kitti")
+    assert sources.open_recording("~/rec").sequences
+    assert plain.PlainRecording("~/rec").sequences
+    assert kitti.KittiRecording(f"~/kitti/{drive.parent.name}").sequences
+    recorder.RunWriter("~/mine", "train", "a").close()
+    assert recorder.is_complete("~/mine", "train", "a") and (tmp_path / "mine/train/a/frames.csv").is_file()
+
+
+def kitti_bytes(drive, name, change):
+    path = drive / name
+    path.write_bytes(change(path.read_bytes()))
+
+
+@pytest.mark.parametrize("name", [lambda k: f"{k:010d}.jpg", lambda k: f"{k:010d}.JPG", lambda k: f"{k:06d}.png"])
+def test_kitti_pictures_may_be_jpeg_upper_case_or_padded_otherwise(tmp_path, name):
+    drive = writers.write_kitti(tmp_path)
+    for path in sorted((drive / "image_02/data").iterdir()):
+        target = path.with_name(name(int(path.stem)))
+        image = Image.open(path)
+        image.load()
+        path.unlink()
+        image.save(target, quality=95) if target.suffix.lower() == ".jpg" else image.save(target)
+    recording = sources.open_recording(drive)
+    assert recording.description.camera is not None
+    assert np.abs(recording.read(recording.sequences[0], 3)["image"].astype(int) - 30).max() <= 2
+
+
+@pytest.mark.parametrize(("name", "change", "message"), [
+    ("oxts/data/0000000000.txt", lambda c: b"\xef\xbb\xbf" + c, None),
+    ("oxts/data/0000000000.txt", lambda c: c.replace(b"10.0", b"1000.0", 1), r"forward speed \(number 9\) is 1000"),
+    ("oxts/data/0000000000.txt", lambda c: b"91 " + c.split(b" ", 1)[1], r"latitude .* is 91; .* degrees"),
+    ("velodyne_points/data/0000000000.bin", lambda c: (np.frombuffer(c, np.float32) * 100).tobytes(),
+     r"reflectance lies between 0 and 1"),
+    ("velodyne_points/data/0000000000.bin", lambda c: (np.frombuffer(c, np.float32).reshape(-1, 4)
+                                                        * np.float32([1e6, 1e6, 1e6, 1])).tobytes(), "points_m has"),
+    ("../calib_cam_to_cam.txt", lambda c: c.replace(b"P_rect_02: 70.0", b"P_rect_02: 0.0"), "make no camera"),
+    ("../calib_velo_to_cam.txt", lambda c: c.replace(b"T: 0 -0.08 -0.3", b"T: 0 -80 -300"), "make no camera: .*puts"),
+])
+def test_kitti_numbers_that_cannot_be_are_refused(tmp_path, name, change, message):
+    drive = writers.write_kitti(tmp_path)
+    kitti_bytes(drive, name, change)
+    if message is None:
+        recording = kitti.KittiRecording(drive)
+        assert recording.read(recording.sequences[0], 0)["speed_mps"] == 10.0
+        return
+    with pytest.raises(schema.DataError, match=message):
+        recording = kitti.KittiRecording(drive)
+        recording.read(recording.sequences[0], 0)
+
+
+def test_one_drive_with_more_takes_no_drive_away(tmp_path):
+    drive = writers.write_kitti(tmp_path)
+    for number in (100, 101):
+        other = drive.with_name(f"2011_09_26_drive_0{number}_sync")
+        shutil.copytree(drive, other)
+        shutil.rmtree(other / "velodyne_points")
+    with pytest.warns(schema.DataWarning, match="only 1 of 3 drives have velodyne_points: it is not used"):
+        recording = kitti.KittiRecording(tmp_path)
+    assert len({sequence.name for sequence in recording.sequences}) == 3 and recording.description.lidar is None
+
+
+def test_frames_without_what_the_model_needs_are_refused_by_name(tmp_path):
+    recording = plain.PlainRecording(writers.write_plain(tmp_path, {"train/a": 30, "val_rl/b": 30}))
+    config = prepare.adapt(presets.tiny(), recording).config
+    frame = recording.read(recording.sequences[0], 0)
+    del frame["points_m"]
+    with pytest.raises(schema.DataError, match="frame 0 has no points_m, which the model needs"):
+        prepare.prepare_frame(frame, config)

@@ -1,0 +1,55 @@
+"""Work in several processes: results, errors as they are, killed workers; and the lock of a folder."""
+
+import os
+import signal
+import threading
+
+import pytest
+
+from muvo_jax.data import processes, schema
+
+
+def halved(minuend, number):
+    """What the workers do here."""
+    if number == 13:
+        raise schema.DataError("thirteen cannot be halved")
+    if number == 99:
+        os.kill(os.getpid(), signal.SIGKILL)
+    return minuend - number / 2
+
+
+def spread(numbers):
+    return sorted(processes.spread(halved, numbers, shared=(100,), workers=2, doing="halving"))
+
+
+def test_results_come_from_all_tasks():
+    assert spread(range(4)) == [98.5, 99.0, 99.5, 100.0]
+
+
+def test_an_error_keeps_its_type_and_words():
+    with pytest.raises(schema.DataError, match=r"^thirteen cannot be halved$"):
+        spread([13])
+
+
+def test_a_killed_worker_is_told():
+    with pytest.raises(RuntimeError, match="a halving process was killed"):
+        spread([99, 1])
+
+
+def test_a_lock_refuses_or_waits(tmp_path):
+    path, order = tmp_path / ".lock", []
+
+    def later():
+        with processes.locked(path, "packing", wait=True):
+            order.append("second")
+
+    with processes.locked(path, "packing"):
+        with (pytest.raises(BlockingIOError, match="another process is packing here now"),
+              processes.locked(path, "packing")):
+            pass
+        thread = threading.Thread(target=later)
+        thread.start()
+        thread.join(timeout=0.2)
+        order.append("first")
+    thread.join(timeout=10)
+    assert order == ["first", "second"]

@@ -18,7 +18,7 @@ from muvo_jax.config import ModelConfig
 from muvo_jax.model import common, memory, outputs, tokens
 from muvo_jax.nn import layers
 from muvo_jax.ops import conv_cpu, resample
-from muvo_jax.types import RANGE_NO_RETURN_M, Vantage
+from muvo_jax.types import RANGE_NO_RETURN_M
 
 SCALES = (1, 2, 4)
 _SHRINK = {"image": tokens.IMAGE_SHRINK, "range_view": tokens.RANGE_VIEW_SHRINK}
@@ -109,14 +109,6 @@ class GuidedHead(linen.Module):
         return compose(raw, glimpse, mean, config)
 
 
-def numbers(vantage: Vantage) -> jax.Array:
-    """[n, 5]: how long ago and how far away the newest observation is, about 1 where that is much."""
-    pose = vantage.motion.pose
-    scaled = pose / jnp.array([10.0, 2.0, 0.3], jnp.float32).reshape(1, 3)
-    steps = vantage.steps.astype(jnp.float32)[:, None] / 5.0
-    return jnp.concatenate([scaled, steps, vantage.motion.speed_mps[:, None] / 10.0], axis=-1)
-
-
 def _see_image(glimpse: memory.ImageGlimpse, config: ModelConfig) -> jax.Array:
     del config
     return jnp.concatenate([glimpse.image - 0.5 * glimpse.covered, glimpse.covered], axis=-1)
@@ -159,9 +151,14 @@ def _compose_ranges(raw, glimpse: memory.RangeGlimpse, mean, config: ModelConfig
         soft = jax.nn.sigmoid(logit)
         # Decided, because half a range is no range; the gradient is that of the probability.
         returned = jax.lax.stop_gradient((logit > 0.0).astype(jnp.float32) - soft) + soft
-        range_ = nothing + returned * (range_ - nothing)
-        points = value[..., :3] + average[scale][..., :3]
-        result[scale] = jnp.concatenate([points, jnp.expand_dims(range_, -1)], axis=-1)
+        expected = nothing + returned * (range_ - nothing)
+        points = average[scale][..., :3]  # with range_view_points="beams" they are differences from the beam already
+        if config.range_view_points == "free":
+            on_beam = outputs.along_beams(jnp.concatenate([jnp.zeros_like(points), jnp.expand_dims(range_, -1)], -1),
+                                          scale, config)
+            points = jnp.where(jnp.expand_dims(filled > 0.0, -1), on_beam[..., :3], points)
+        points = value[..., :3] + points
+        result[scale] = jnp.concatenate([points, jnp.expand_dims(expected, -1)], axis=-1)
     return result
 
 

@@ -19,7 +19,7 @@ from muvo_jax.config import NO_SENSOR, ModelConfig
 from muvo_jax.geometry import VoxelGrid
 from muvo_jax.ops import motion as motion_ops
 from muvo_jax.ops import reproject
-from muvo_jax.types import RANGE_NO_RETURN_M, Array, Batch, LatentState, Memory, Motion, Vantage
+from muvo_jax.types import RANGE_NO_RETURN_M, UNTIMED_FIELDS, Array, Batch, LatentState, Memory, Motion, Vantage
 
 FADE = 0.8  # weight of evidence that is one observation older: what moved away is forgotten
 
@@ -94,7 +94,7 @@ def initial_vantage(config: ModelConfig, batch_size: int) -> Vantage:
     """Before anything was seen: no observation is remembered."""
     zeros = jnp.zeros((batch_size,), jnp.int32)
     standing = Motion(jnp.zeros((batch_size, 3), jnp.float32), jnp.zeros((batch_size,), jnp.float32))
-    return Vantage(standing, zeros + config.memory_frames, zeros + config.memory_frames - 1, zeros)
+    return Vantage(standing, zeros + config.memory_frames + 1, zeros + config.memory_frames, zeros)
 
 
 def intended(config: ModelConfig, vantage: Vantage, action: Array) -> Motion:
@@ -161,11 +161,14 @@ def _remembered(config: ModelConfig, batch: Batch, poses: Array) -> Memory | Non
 
 
 def empty(config: ModelConfig, batch_size: int) -> Memory | None:
-    """The memory of a stream before its first observation, of config.memory_frames places."""
+    """The memory of a stream before its first observation: config.memory_frames places and the newest one's.
+
+    That one is hidden from the decoders of its own state, which look at as many before it, as those of a window do.
+    """
     heads = guessed_heads(config)
     if not heads:
         return None
-    lead, view = (batch_size, config.memory_frames), config.range_view
+    lead, view = (batch_size, config.memory_frames + 1), config.range_view
     memory = Memory(jnp.zeros((*lead, 3), jnp.float32),
                     jnp.full((*lead, view.rows, view.columns, 4), -1.0, jnp.float32))
     if "image" not in heads:
@@ -196,8 +199,8 @@ def check(config: ModelConfig, states: LatentState | Array, memory: Memory | Non
     """The flat vantage and rows of states [*lead, ...] that are decoded with a memory.
 
     Raises:
-      ValueError: if there is no vantage or no memory, the memory is of other sizes, or the states' first axis does not
-        count its drives.
+      ValueError: if there is no vantage or no memory, the memory is of other sizes, or neither `rows` nor the states'
+        first axis says which of its drives a state belongs to.
     """
     heads = ", ".join(guessed_heads(config))
     if not isinstance(states, LatentState) or states.vantage is None or memory is None:
@@ -206,16 +209,21 @@ def check(config: ModelConfig, states: LatentState | Array, memory: Memory | Non
         raise ValueError(f"decode: got {came}{' and no memory' if memory is None else ''}, but the heads {heads} of "
                          f"this model (first_guess='last_seen') look at what was seen of late. Pass states of "
                          f"`observe` or `imagine` and memory=observed.memory (live.memory of a stream).")
-    drives = memory.pose.shape[0]
+    drives, frames = memory.pose.shape[:2]
     for name, shape in inputs(config).items():
         value = getattr(memory, name)
-        if value is None or value.shape[-len(shape):] != shape or value.shape[0] != drives:
+        expected = (drives, *(() if name in UNTIMED_FIELDS else (frames,)), *shape)
+        if value is None or value.shape != expected:
             raise ValueError(f"decode: memory.{name} is {None if value is None else list(value.shape)}, expected "
-                             f"[{drives}, ..., {', '.join(map(str, shape))}]; this memory belongs to another model.")
+                             f"{list(expected)} beside memory.pose {list(memory.pose.shape)}; this memory belongs to "
+                             f"another model or is of two.")
     flat = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[len(lead):]), states.vantage)
     count = flat.last.shape[0]
     if rows is not None:
-        return flat, jnp.asarray(rows, jnp.int32).reshape(-1)
+        rows = jnp.asarray(rows, jnp.int32)
+        if rows.shape != lead:
+            raise ValueError(f"decode: got rows {list(rows.shape)}, expected {list(lead)}, a drive for each state.")
+        return flat, rows.reshape(-1)
     if (lead[0] if lead else 1) != drives:
         raise ValueError(f"decode: got states [{', '.join(map(str, (*lead, '...')))}] and a memory of {drives} drives; "
                          f"the first axis of the states must count the drives. Pass rows= otherwise.")
@@ -223,8 +231,11 @@ def check(config: ModelConfig, states: LatentState | Array, memory: Memory | Non
 
 
 def look(config: ModelConfig, memory: Memory, rows: Array, vantage: Vantage,
-         heads: tuple[str, ...]) -> dict[str, Glimpse]:
+         heads: tuple[str, ...]) -> tuple[dict[str, Glimpse], Array]:
     """The memory as it looks from n vantages, for those of the heads that it can tell something.
+
+    Beside it, `numbers` [n, 5]: how far the car is from where the newest observation in sight was taken (forward, left,
+    turn; zeros where there is none), how many steps are imagined and how fast it is; about 1 where that is much.
 
     Args:
       config: of the model.
@@ -234,8 +245,6 @@ def look(config: ModelConfig, memory: Memory, rows: Array, vantage: Vantage,
       heads: what is decoded.
     """
     heads = tuple(head for head in guessed_heads(config) if head in heads)
-    if not heads:
-        return {}
     places = config.memory_frames
     stop = vantage.last + (vantage.steps > 0)
     index = stop[:, None] + jnp.arange(-places, 0, dtype=jnp.int32)[None]
@@ -250,7 +259,9 @@ def look(config: ModelConfig, memory: Memory, rows: Array, vantage: Vantage,
         glimpses["range_view"] = view = _ranges(config, memory, rows, index, known, pose)
         if "image" in heads:
             glimpses["image"] = _image(config, memory, rows, index[:, -1], known[:, -1], pose[:, -1], view)
-    return {head: glimpses[head] for head in heads}
+    apart = jnp.where(known[:, -1:], pose[:, -1], 0.0) / jnp.array([10.0, 2.0, 0.3], jnp.float32).reshape(1, 3)
+    numbers = [apart, vantage.steps.astype(jnp.float32)[:, None] / 5.0, vantage.motion.speed_mps[:, None] / 10.0]
+    return {head: glimpses[head] for head in heads}, jnp.concatenate(numbers, axis=-1)
 
 
 def _ranges(config: ModelConfig, memory: Memory, rows: Array, index: Array, known: Array, pose: Array) -> RangeGlimpse:
@@ -261,8 +272,9 @@ def _ranges(config: ModelConfig, memory: Memory, rows: Array, index: Array, know
     valid = (scans[..., 3] > 0.0) & jnp.expand_dims(known, -1)
     splat = lambda part: reproject.onto_beams(reproject.splat(
         points_m[:, part].reshape(len(rows), -1, 3), valid[:, part].reshape(len(rows), -1), geometry), geometry)
-    newest, older = splat(slice(-1, None)), splat(slice(None, -1))
-    moved = jnp.where(newest[..., 3:] > 0.0, newest, older)
+    moved = newest = splat(slice(-1, None))
+    if index.shape[1] > 1:
+        moved = jnp.where(newest[..., 3:] > 0.0, newest, splat(slice(None, -1)))
     still = scans[:, -1].reshape(*newest.shape)
     fresh = known[:, -1].reshape(-1, 1, 1)
     sky = reproject.move_sky(still, pose[:, -1], geometry) & fresh & (moved[..., 3] <= 0.0)

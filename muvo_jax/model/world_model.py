@@ -118,7 +118,7 @@ class Network(linen.Module):
         numbers = None
         if memory is not None:
             assert vantage is not None and rows is not None  # as memory.check returns them
-            glimpses, numbers = memory_lib.look(self.config, memory, rows, vantage, names), guided.numbers(vantage)
+            glimpses, numbers = memory_lib.look(self.config, memory, rows, vantage, names)
         raw = {}
         for name in names:
             read = self.read(features, name)
@@ -153,6 +153,13 @@ class WorldModel:
     """
 
     config: ModelConfig
+
+    def __post_init__(self):
+        config = self.config
+        if config.tracks_motion and config.kinematics is None and "ego_motion" not in config.heads:
+            raise ValueError(f"model.first_guess=last_seen moves what was seen as the car moves, but model.kinematics "
+                             f"is None and the heads are {', '.join(config.heads)}. Take the model of a Config whose "
+                             f"contract.kinematics is 'bicycle' (Config.model), or add the head ego_motion.")
 
     @property
     def feature_shape(self) -> tuple[int, ...]:

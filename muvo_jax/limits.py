@@ -91,7 +91,7 @@ def check(instance: Any) -> None:
     Raises:
       RangeError: naming class, field, value and range.
     """
-    for name, limits, whole in of(type(instance)):
+    for name, limits, whole in of(type(instance)):  # type: ignore[arg-type]  # classes are hashable
         value = getattr(instance, name)
         for number in _numbers(value):
             if isinstance(number, bool) or not isinstance(number, numbers.Real) or (

@@ -98,7 +98,8 @@ def find_files(run: Run, kind: str) -> KindFiles:
     Raises:
       DataError: where files are there, but none that the table names.
     """
-    present, unusual = np.zeros(run.frames, bool), {}
+    present = np.zeros(run.frames, bool)
+    unusual: dict[int, pathlib.Path] = {}
     if f"{kind}_path" not in run.columns:
         return KindFiles(present, unusual)
     paths = [run.path(kind, row) for row in range(run.frames)]

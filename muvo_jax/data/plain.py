@@ -173,12 +173,12 @@ class PlainRecording:
             values = files.read_image(path, _MODES[name])
             values = decode_depth(values) if name == "depth_m" else values
         camera, grid = described.camera, described.voxels
-        sizes: dict[str | int, int | None] = {"N": None}
+        sizes: dict[str, int | None] = dict.fromkeys("HWNXYZ")
         if camera is not None:
             sizes |= {"H": camera.height_px, "W": camera.width_px}
         if grid is not None:
             sizes |= dict(zip("XYZ", grid.shape, strict=True))
-        values = fields.conform(name, values, str(path), tuple(sizes.get(size, size) if isinstance(size, str) else size
+        values = fields.conform(name, values, str(path), tuple(size if isinstance(size, int) else sizes[size]
                                                                for size in field.shape))
         if name in ("image_classes", "point_classes"):
             fields.check_classes(name, values, self._class_names, str(path))

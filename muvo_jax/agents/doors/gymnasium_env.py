@@ -75,7 +75,7 @@ class GymnasiumImagination(Env):
         return kept | {"params": jax.device_get(self.params), "_state": jax.device_get(self._state)}
 
     def __setstate__(self, kept):
-        vars(self).update(kept)
+        self.__dict__.update(kept)
         self.params = jax.tree.map(jnp.asarray, self.params)
         self._compile()
 

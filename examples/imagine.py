@@ -19,7 +19,8 @@ def main(folder: str) -> None:
     brake_or_go = jnp.stack([jnp.full((8, 2), -0.5), jnp.full((8, 2), 0.5)])  # [B = 2, horizon = 8, 2]
     dream = muvo_jax.imagine(model, variables, key_imagine, observed.last, brake_or_go.at[..., 1].set(0.0), branches=16)
     print("16 futures of 8 steps for 2 starts:", dream.features.shape)
-    predictions = muvo_jax.decode(model, variables, dream.states[:, 0, ::4], heads=("image", "occupancy"))
+    predictions = muvo_jax.decode(model, variables, dream.states[:, 0, ::4], heads=("image", "occupancy"),
+                                  memory=observed.memory)
     print("decoded, 1 branch, every fourth step:", {head: predictions[head].shape for head in predictions})
 
 

@@ -4,8 +4,8 @@
     batch = muvo_jax.windows(run, frames=6)
     observed = muvo_jax.observe(run.model, run.variables, key, batch)
     dream = muvo_jax.imagine(run.model, run.variables, key, observed.last, actions)
-    predictions = muvo_jax.decode(run.model, run.variables, dream.states, heads=("image", "occupancy"))
-    predictions.image, predictions.at_scale(2).occupancy
+    predictions = muvo_jax.decode(run.model, run.variables, dream.states, ("image",), memory=observed.memory)
+    predictions.image, predictions.at_scale(2).image
 
 Everything is a pure function of explicit pytrees, with arguments in one order: (model, variables, key, what goes in);
 see docs/design.md.

@@ -180,7 +180,8 @@ class ModelConfig:
     @property
     def tracks_motion(self) -> bool:
         """Whether states know where the car is and how fast (LatentState.vantage)."""
-        return self.first_guess == "last_seen" or (self.action_path == "recurrence" and self.kinematics is not None)
+        remembers = self.first_guess == "last_seen" and self.lidar != NO_SENSOR  # nothing moves without ranges
+        return remembers or (self.action_path == "recurrence" and self.kinematics is not None)
 
     @property
     def variant(self) -> str:
@@ -212,6 +213,8 @@ class ModelConfig:
         if gridded and any(side % shrink for side in self.voxels.shape):
             raise ValueError(f"model.voxels.shape {self.voxels.shape}: each side must be a multiple of {shrink} "
                              f"(2**({field} + 3)).")
+        if self.memory_frames < 1:
+            raise ValueError(f"model.memory_frames is {self.memory_frames}; it must be at least 1.")
         self._check_variant()
 
     def _check_variant(self):

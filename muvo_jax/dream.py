@@ -77,7 +77,7 @@ def dream(options: Options, show: screen.Screen) -> list[pathlib.Path]:
     config = evaluate.fit(config, recording, tuple(chosen))
     window = choose_window(recording, config, options)
     batch = pipeline.Frames(recording, config).batch([window], judged=True)
-    futures = dream_window(loaded.model, loaded.variables, jax.random.key(options.seed), batch,
+    futures = dream_window(world_model.WorldModel(config.model), loaded.variables, jax.random.key(options.seed), batch,
                            context=config.data.context, horizon=config.data.horizon, branches=options.branches)
     labels = ["world model"] if options.branches == 1 else [f"future {index + 1}" for index in range(len(futures))]
     views = {label: sheets.views_of_frames(frames, 0)

@@ -8,6 +8,7 @@ import pathlib
 from collections.abc import Mapping
 from typing import Any
 
+import numpy as np
 import rich.table
 
 from muvo_jax.data import words
@@ -31,35 +32,35 @@ METRICS = {
 SOURCES = {"model": "model", "copy_last": "copy-last", "warp_last": "warp-last", "warp_fused": "warp-fused",
            "training_mean": "training mean"}
 HEADS = {"image": "image", "range_view": "range", "occupancy": "voxels above the road"}
+SCREEN_METRICS = ("psnr_db", "chamfer_m", "chamfer_above_m", "iou_occ_above_observed", "iou_occ_movers",
+                  "iou_occ_observed", "iou_occ_all", "depth_error_m", "semantic_image_share", "birds_eye_share")
 STEP_METRICS = ("psnr_db", "chamfer_m", "iou_occ_above_observed", "iou_occ_observed", "iou_occ_all", "iou_occ_movers")
 
 
 def screen_table(split: str, phase: str, scores: Mapping[str, Any]) -> rich.table.Table:
-    """One split and phase: a row for each metric, the best source bold."""
-    phase_scores = scores[phase]
-    title = f"{split}: {phase} frames, {counts_text(scores)}"
-    table = rich.table.Table(title=title, title_justify="left")
+    """One split and phase: a row for each headline, the best source bold; of imagined frames the last step in brackets.
+
+    report.md has every metric and step.
+    """
+    phase_scores, imagined = scores[phase], phase == "imagined"
+    last_step = f" (step {len(next(iter(phase_scores['model'].values()))['per_step'])})" if imagined else ""
+    table = rich.table.Table(title=f"{split}: {phase} frames{last_step}, {counts_text(scores)}", title_justify="left")
     table.add_column("metric")
     for source in phase_scores:
         table.add_column(SOURCES[source], justify="right")
-    table.add_column("model,\n95 %", justify="right")
-    if phase == "imagined":
-        steps = max(len(metric["per_step"]) for metric in phase_scores["model"].values())
-        for source in phase_scores:
-            table.add_column(f"{SOURCES[source]}\nat step {steps}", justify="right")
-    table.add_column("undefined\nframes", justify="right")
-    for name, (label, decimals, higher) in METRICS.items():
+    table.add_column("model, 95 %", justify="right")
+    for name in SCREEN_METRICS:
         if name not in phase_scores["model"]:
             continue
-        means = {source: metrics[name]["mean"] for source, metrics in phase_scores.items() if name in metrics}
+        label, decimals, higher = METRICS[name]
+        shown = [source for source in phase_scores if name in phase_scores[source]]
+        means = {source: phase_scores[source][name]["mean"] for source in shown}
         cells = marked(means, phase_scores, decimals, higher, "[bold]{}[/bold]")
-        cells.append(interval_text(phase_scores["model"][name], decimals))
-        if phase == "imagined":
-            last = {source: metrics[name]["per_step"][-1]
-                    for source, metrics in phase_scores.items() if name in metrics}
-            cells += marked(last, phase_scores, decimals, higher, "[bold]{}[/bold]")
-        undefined = [str(metrics[name].get("undefined", "")) for metrics in phase_scores.values() if name in metrics]
-        table.add_row(label, *cells, " / ".join(part for part in undefined if part))
+        if imagined:
+            last = {source: phase_scores[source][name]["per_step"][-1] for source in shown}
+            ends = marked(last, phase_scores, decimals, higher, "[bold]{}[/bold]")
+            cells = [f"{cell} ({end})" if cell else "" for cell, end in zip(cells, ends, strict=True)]
+        table.add_row(label, *cells, interval_text(phase_scores["model"][name], decimals))
     return table
 
 
@@ -105,7 +106,9 @@ def write_report(folder: pathlib.Path, report: Mapping[str, Any], suffix: str = 
 
 
 def json_ready(value):
-    """Strict JSON: floats that are not finite become strings."""
+    """Strict JSON: NumPy's numbers become Python's, floats that are not finite strings."""
+    if isinstance(value, np.generic):
+        value = value.item()
     if isinstance(value, Mapping):
         return {name: json_ready(item) for name, item in value.items()}
     if isinstance(value, (list, tuple)):

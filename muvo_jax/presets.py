@@ -12,11 +12,12 @@ from muvo_jax import config as config_lib
 def town() -> config_lib.Config:
     """The default: a world model small enough to learn the built-in town on two CPU cores in minutes.
 
-    A few hundred updates are too few for the paper's recipe. Decoders start from the average training frame and draw
-    lidar points along their beams, so that the latent has to say only what is special about a frame; each token of the
-    2D latent starts from what the observation has in its place, and fusion into a vector keeps the few cells of the
-    small maps apart. A training window shows three frames and asks for five more, imagined as in
-    evaluation; one of the eight is decoded, so that a batch shows twelve places and weathers, which BatchNorm needs.
+    A few hundred updates are too few for the paper's recipe. Decoders start from what was last seen, moved by the
+    actions, and from the average training frame where that covers nothing; each token of the 2D latent starts from what
+    the observation has in its place, and fusion into a vector keeps the few cells of the small maps apart. A training
+    window is as long as evaluation's: six frames are observed, cut in two at a frame drawn anew, so that a dream starts
+    after one to six of them, and six are imagined; two of the twelve are decoded. Mirrored windows and windows in
+    another light stand in for towns and weathers that are not there.
     Image, range, points and the cross-entropy of occupancy weigh more than in the paper, where action and KL
     divergence speak loudest, and the affinity losses less: alone they call a voxel occupied that is so in a third of
     the frames.
@@ -60,10 +61,10 @@ def town() -> config_lib.Config:
                                    occupancy_cross_entropy=3.0, occupancy_semantic_scal=0.05,
                                    occupancy_geometric_scal=0.05, occupancy_unknown_weight=0.15, action=0.2, kl=5e-4),
         augmentation=config_lib.AugmentationConfig(mirror=True, light=True),
-        optimizer=config_lib.OptimizerConfig(learning_rate=2e-3, warmup_fraction=0.1, clip_norm=10.0),
+        optimizer=config_lib.OptimizerConfig(learning_rate=3e-3, warmup_fraction=0.1, clip_norm=10.0),
         data=config_lib.DataConfig(frames=12),
-        train=config_lib.TrainConfig(steps=460, batch=8, decode_frames=2, observe_frames=6, restart=True,
-                                     validate_every=230, checkpoint_every=230, preview_every=460, validation_windows=8),
+        train=config_lib.TrainConfig(steps=200, batch=8, decode_frames=2, observe_frames=6, restart=True,
+                                     validate_every=100, checkpoint_every=100, preview_every=200, validation_windows=8),
         evaluation=config_lib.EvaluationConfig(windows=32),
     )
 

@@ -199,14 +199,14 @@ class Memory(_Indexable):
 
     Attributes:
       pose: float32 [B, F, 3], x, y, yaw of each in the ego frame of the newest, which is the last one.
-      range_view: float32 [B, F, Hr, Wr, 4], as Batch.range_view; None for a model without lidar.
+      range_view: float32 [B, F, Hr, Wr, 4], as Batch.range_view; without lidar there is no memory.
       image: uint8 [B, F, H, W, 3], as Batch.image; None for a model without camera.
       intrinsics, camera_to_ego: float32 [B, 3, 3] and [B, 4, 4]; None without image.
       evidence: float32 [B, X', Y', 2 Z] for voxels, worked out once for many states (memory.with_evidence); or None.
     """
 
     pose: Array
-    range_view: Array | None = None
+    range_view: Array
     image: Array | None = None
     intrinsics: Array | None = None
     camera_to_ego: Array | None = None

@@ -55,7 +55,7 @@ def test_a_sealed_model_gives_the_same_numbers_without_the_library(tmp_path):
     actions = random.uniform(-1, 1, (3, 3, 2)).astype(np.float32)
     given = {"previous_action": np.zeros((3, 2), np.float32), "actions": actions, "keys": jax.random.key_data(keys),
              "live/keys": jax.random.key_data(stream.keys), "live/frame": stream.frame}
-    given |= {f"live/{name}": value for name, value in vars(stream.latent).items()}
+    given |= {f"live/{name}": value for name, value in export.to_arrays(stream.latent).items()}
     given |= {f"observation/{name}": value for name, value in observation.items()}
     np.savez(tmp_path / "given.npz", **given)
     subprocess.run([sys.executable, "-c", PROGRAM, str(tmp_path)], check=True, cwd=tmp_path)

@@ -49,5 +49,6 @@ def test_paper_presets_have_the_papers_lengths_and_heads():
                                                    for camera in config_lib.CAMERA_ENCODERS)])
 def test_the_town_preset_exists_for_every_variant_at_a_small_size(variant):
     config = dataclasses.replace(presets.get("town").model, **variant)
-    # AVG is the largest: both of its vectors must be as wide as the embedding that is their mean.
-    assert 3e6 < parameters(config) < 25e6
+    # AVG is the largest: both of its vectors must be as wide as the embedding that is their mean. The 2D latent is the
+    # smallest: no vector is unfolded into maps, and the route's encoder is small.
+    assert 2.5e6 < parameters(config) < 25e6

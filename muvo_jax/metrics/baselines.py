@@ -79,8 +79,9 @@ class TrainingMean:
         if batch.occupancy is not None:
             coarse = {1: np.asarray(batch.occupancy)}
             for scale in COARSE_SCALES:
-                if not any(side % 2 for side in coarse[scale // 2].shape[2:]):
-                    coarse[scale] = resample.pool_occupancy(coarse[scale // 2])
+                if any(side % 2 for side in coarse[scale // 2].shape[2:]):
+                    break  # no decoder has such scales
+                coarse[scale] = resample.pool_occupancy(coarse[scale // 2])
             count = lambda mask: mask.sum(axis=(0, 1), dtype=np.int64)
             sums["occupied"] = {scale: count(value == types.OCCUPANCY_OCCUPIED) for scale, value in coarse.items()}
             sums["known"] = {scale: count(value != types.OCCUPANCY_UNKNOWN) for scale, value in coarse.items()}

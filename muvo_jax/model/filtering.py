@@ -10,14 +10,14 @@ A subclass says how the state moves and how it looks at actions and observations
 
 As in the reference the action enters the prior and the posterior. With action_path="recurrence" what it does, its
 `effect`, enters everything: a prior that reads one action among many tokens learns to ignore it. Differs from the
-reference in
-the slope of the leaky ReLUs, 0.01 here and 1 there (numerics="reference"), and in drawing the RSSM dropout's coin per
-sample instead of per batch.
+reference in the slope of the leaky ReLUs, 0.01 here and 1 there (numerics="reference"), and in drawing the RSSM
+dropout's coin per sample instead of per batch.
 """
 
 from __future__ import annotations
 
 import abc
+import dataclasses
 
 import jax
 import jax.numpy as jnp
@@ -86,8 +86,9 @@ class Transition(linen.Module, abc.ABC):
     def initial_state(cls, config: ModelConfig, batch_size: int) -> LatentState:
         """The zero state, [batch_size, ...], before anything was seen."""
         vantage = memory.initial_vantage(config, batch_size) if config.tracks_motion else None
-        return LatentState(*(jnp.zeros((batch_size, *shape), jnp.float32) for shape in cls.state_shapes(config)),
-                           vantage)
+        deterministic, stochastic = cls.state_shapes(config)
+        return LatentState(jnp.zeros((batch_size, *deterministic), jnp.float32),
+                           jnp.zeros((batch_size, *stochastic), jnp.float32), vantage)
 
     def observe_step(self, noise: StepNoise, state: LatentState, action: jax.Array, embedding: jax.Array,
                      is_first: jax.Array) -> tuple[LatentState, tuple[Gaussian, Gaussian]]:
@@ -99,25 +100,27 @@ class Transition(linen.Module, abc.ABC):
         prior = self.predict(deterministic, action, effect, noise.dropout)
         posterior = self.infer(deterministic, embedding, action, effect, noise.dropout)
         stochastic = where(noise.use_prior & ~is_first, prior.sample(noise.prior), posterior.sample(noise.posterior))
-        return state.replace(deterministic=deterministic, stochastic=stochastic), (prior, posterior)
+        return dataclasses.replace(state, deterministic=deterministic, stochastic=stochastic), (prior, posterior)
 
     def imagine_step(self, noise: jax.Array, state: LatentState, action: jax.Array) -> tuple[LatentState, Gaussian]:
         """One step without an observation; see WorldModel.imagine_step."""
         effect, step = self.effect(action, state)
         deterministic = self.recur(state, effect)
         prior = self.predict(deterministic, action, effect, None)
-        vantage = state.vantage if step is None else memory.moved_on(state.vantage, step)
+        vantage = state.vantage
+        if vantage is not None and step is not None:
+            vantage = memory.moved_on(vantage, step)
         return LatentState(deterministic, prior.sample(noise), vantage), prior
 
     def effect(self, action: jax.Array, state: LatentState) -> tuple[jax.Array | None, Motion | None]:
         """What an action does: as the recurrence reads it, and the step of the car, each where the model knows it."""
-        config = self.config
-        step = memory.intended(config, state.vantage, action) if config.tracks_motion and config.kinematics else None
+        config, vantage = self.config, state.vantage
+        step = memory.intended(config, vantage, action) if vantage is not None and config.kinematics else None
         if config.action_path == "prior":
             return None, step
         parts = [action / layers.per_channel(self.action_spread.value, action.ndim)]
-        if step is not None:
-            gained_mps = step.speed_mps - state.vantage.motion.speed_mps
+        if vantage is not None and step is not None:
+            gained_mps = step.speed_mps - vantage.motion.speed_mps
             moved = jnp.concatenate([step.pose, jnp.stack([gained_mps, step.speed_mps], axis=-1)], axis=-1)
             parts.append(moved / layers.per_channel(jnp.asarray(_STEP_UNITS, jnp.float32), moved.ndim))
         return jnp.concatenate(parts, axis=-1), step

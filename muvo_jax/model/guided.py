@@ -8,6 +8,7 @@ and learns the rest: to fill what was hidden, to move what moves, to blur what i
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
@@ -17,7 +18,7 @@ from muvo_jax.config import ModelConfig
 from muvo_jax.model import common, memory, outputs, tokens
 from muvo_jax.nn import layers
 from muvo_jax.ops import conv_cpu, resample
-from muvo_jax.types import RANGE_NO_RETURN_M, Vantage
+from muvo_jax.types import RANGE_NO_RETURN_M
 
 SCALES = (1, 2, 4)
 _SHRINK = {"image": tokens.IMAGE_SHRINK, "range_view": tokens.RANGE_VIEW_SHRINK}
@@ -68,9 +69,11 @@ class GuidedDecoder(linen.Module):
             x = conv(f"draw_{scale}", jnp.concatenate([x, down[scale]], axis=-1), width // _WIDTHS[scale])
             out[scale] = dense(f"head_{scale}", x, channels[scale]).astype(jnp.float32)
         # Full size is drawn in blocks of 2x2 pixels: a quarter of the places, with channels enough for a fast product.
-        x = conv("draw_1", jnp.concatenate([x, conv_cpu.space_to_depth(down[1], (2, 2))], axis=-1), width // _WIDTHS[2])
-        blocks = dense("head_1", x, 4 * channels[1]).astype(jnp.float32)
-        return {1: conv_cpu.depth_to_space(blocks, (2, 2)), **out}
+        seen = conv_cpu.space_to_depth(down[1], (2, 2))
+        x = conv("draw_1", jnp.concatenate([x, seen], axis=-1), width // _WIDTHS[2])
+        # What is uncertain is best blurred, a linear function of what is seen, and learned soonest as one.
+        blocks = dense("head_1", x, 4 * channels[1]) + layers.Conv(4 * channels[1], (3, 3), compute, name="blur")(seen)
+        return {1: conv_cpu.depth_to_space(blocks.astype(jnp.float32), (2, 2)), **out}
 
     def _latent(self, features: jax.Array, width: int) -> jax.Array:
         """The latent as a map of the plane: the head's tokens, or a vector unfolded."""
@@ -106,20 +109,12 @@ class GuidedHead(linen.Module):
         return compose(raw, glimpse, mean, config)
 
 
-def numbers(vantage: Vantage) -> jax.Array:
-    """[n, 5]: how long ago and how far away the newest observation is, about 1 where that is much."""
-    pose = vantage.motion.pose
-    scaled = pose / jnp.array([10.0, 2.0, 0.3], jnp.float32).reshape(1, 3)
-    steps = vantage.steps.astype(jnp.float32)[:, None] / 5.0
-    return jnp.concatenate([scaled, steps, vantage.motion.speed_mps[:, None] / 10.0], axis=-1)
-
-
-def _see_image(glimpse: memory.Glimpse, config: ModelConfig) -> jax.Array:
+def _see_image(glimpse: memory.ImageGlimpse, config: ModelConfig) -> jax.Array:
     del config
     return jnp.concatenate([glimpse.image - 0.5 * glimpse.covered, glimpse.covered], axis=-1)
 
 
-def _compose_image(raw, glimpse: memory.Glimpse, mean, config: ModelConfig) -> dict[int, jax.Array]:
+def _compose_image(raw, glimpse: memory.ImageGlimpse, mean, config: ModelConfig) -> dict[int, jax.Array]:
     del config
     drawn, average = raw, mean(jax.tree.map(jnp.zeros_like, raw))
     moved, covered, result = glimpse.image, glimpse.covered, {}
@@ -134,7 +129,7 @@ def _nearness(range_m: jax.Array) -> jax.Array:
     return jnp.where(range_m > 0.0, _NEAR_M / (_NEAR_M + jnp.maximum(range_m, 0.0)), 0.0)
 
 
-def _see_ranges(glimpse: memory.Glimpse, config: ModelConfig) -> jax.Array:
+def _see_ranges(glimpse: memory.RangeGlimpse, config: ModelConfig) -> jax.Array:
     scale_m = config.range_scale_m
     given = [glimpse.filled_m, glimpse.newest_m, glimpse.still_m]
     channels = [*map(_nearness, given), *(jnp.maximum(value, 0.0) / scale_m for value in (given[0], given[2])),
@@ -143,7 +138,7 @@ def _see_ranges(glimpse: memory.Glimpse, config: ModelConfig) -> jax.Array:
     return jnp.stack(channels, axis=-1)
 
 
-def _compose_ranges(raw, glimpse: memory.Glimpse, mean, config: ModelConfig) -> dict[int, jax.Array]:
+def _compose_ranges(raw, glimpse: memory.RangeGlimpse, mean, config: ModelConfig) -> dict[int, jax.Array]:
     """x, y, z and range in units of range_scale_m; the range is -1 m where nothing is expected to return."""
     average = mean({scale: jnp.zeros_like(value[..., :4]) for scale, value in raw.items()})
     nothing, result = RANGE_NO_RETURN_M / config.range_scale_m, {}
@@ -156,18 +151,23 @@ def _compose_ranges(raw, glimpse: memory.Glimpse, mean, config: ModelConfig) -> 
         soft = jax.nn.sigmoid(logit)
         # Decided, because half a range is no range; the gradient is that of the probability.
         returned = jax.lax.stop_gradient((logit > 0.0).astype(jnp.float32) - soft) + soft
-        range_ = nothing + returned * (range_ - nothing)
-        points = value[..., :3] + average[scale][..., :3]
-        result[scale] = jnp.concatenate([points, jnp.expand_dims(range_, -1)], axis=-1)
+        expected = nothing + returned * (range_ - nothing)
+        points = average[scale][..., :3]  # with range_view_points="beams" they are differences from the beam already
+        if config.range_view_points == "free":
+            on_beam = outputs.along_beams(jnp.concatenate([jnp.zeros_like(points), jnp.expand_dims(range_, -1)], -1),
+                                          scale, config)
+            points = jnp.where(jnp.expand_dims(filled > 0.0, -1), on_beam[..., :3], points)
+        points = value[..., :3] + points
+        result[scale] = jnp.concatenate([points, jnp.expand_dims(expected, -1)], axis=-1)
     return result
 
 
-def _see_voxels(glimpse: memory.Glimpse, config: ModelConfig) -> jax.Array:
+def _see_voxels(glimpse: memory.VoxelGlimpse, config: ModelConfig) -> jax.Array:
     del config
     return jnp.concatenate([glimpse.newest, glimpse.older], axis=-1)
 
 
-def _compose_voxels(raw, glimpse: memory.Glimpse, mean, config: ModelConfig) -> dict[int, jax.Array]:
+def _compose_voxels(raw, glimpse: memory.VoxelGlimpse, mean, config: ModelConfig) -> dict[int, jax.Array]:
     grid = config.voxels
     heights = grid.origin_m[2] + grid.voxel_size_m * jnp.arange(grid.shape[2], dtype=jnp.float32)
     trust = jnp.where(heights >= _OVER_ROAD_M - 1e-3, _TRUST, 0.0).reshape(1, 1, 1, -1)
@@ -182,5 +182,6 @@ def _compose_voxels(raw, glimpse: memory.Glimpse, mean, config: ModelConfig) -> 
     return result
 
 
-_PARTS = {"image": (_see_image, _compose_image), "range_view": (_see_ranges, _compose_ranges),
-          "occupancy": (_see_voxels, _compose_voxels)}
+_PARTS: dict[str, tuple[Callable, Callable]] = {
+    "image": (_see_image, _compose_image), "range_view": (_see_ranges, _compose_ranges),
+    "occupancy": (_see_voxels, _compose_voxels)}

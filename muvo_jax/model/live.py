@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 from collections.abc import Mapping
 
@@ -12,7 +13,7 @@ import jax.numpy as jnp
 from muvo_jax.model import checks, rollout
 from muvo_jax.model import memory as memory_lib
 from muvo_jax.model.world_model import WorldModel, inputs
-from muvo_jax.types import UNTIMED_FIELDS, Array, ArrayLike, Batch, LatentState, Memory, Motion, Variables
+from muvo_jax.types import UNTIMED_FIELDS, Array, ArrayLike, Batch, LatentState, Memory, Motion, Vantage, Variables
 
 
 @flax.struct.dataclass
@@ -95,10 +96,12 @@ def _observe_step(model, variables, live, batch, sampled):
         return LiveState(latent, live.keys, live.frame + 1)
     before = live.latent.vantage
     step, speed_mps = _measured(model, variables, batch, before, latent)
-    still = Motion(jnp.zeros_like(before.motion.pose), speed_mps)
-    vantage = before.replace(motion=still, first=jnp.maximum(before.first - 1, 0), steps=jnp.zeros_like(before.steps))
+    still, places = Motion(jnp.zeros_like(before.motion.pose), speed_mps), model.config.memory_frames
+    # Counted from the frame's number, so that a stream may start from zeros (muvo_jax.export).
+    first = jnp.maximum(jnp.where(batch.is_first[:, 0], places, before.first) - 1, 0)
+    vantage = Vantage(still, first, jnp.full_like(first, places - 1), jnp.zeros_like(first))
     remembered = None if live.memory is None else memory_lib.remember(live.memory, batch, step)
-    return LiveState(latent.replace(vantage=vantage), live.keys, live.frame + 1, remembered)
+    return LiveState(dataclasses.replace(latent, vantage=vantage), live.keys, live.frame + 1, remembered)
 
 
 def _measured(model, variables, batch, before, latent):

@@ -9,6 +9,8 @@ nothing. docs/memory.md says what this brings and what it cannot do.
 
 from __future__ import annotations
 
+import dataclasses
+
 import flax.struct
 import jax
 import jax.numpy as jnp
@@ -17,35 +19,56 @@ from muvo_jax.config import NO_SENSOR, ModelConfig
 from muvo_jax.geometry import VoxelGrid
 from muvo_jax.ops import motion as motion_ops
 from muvo_jax.ops import reproject
-from muvo_jax.types import RANGE_NO_RETURN_M, Array, Batch, LatentState, Memory, Motion, Vantage
+from muvo_jax.types import RANGE_NO_RETURN_M, UNTIMED_FIELDS, Array, Batch, LatentState, Memory, Motion, Vantage
 
 FADE = 0.8  # weight of evidence that is one observation older: what moved away is forgotten
 
 
 @flax.struct.dataclass
-class Glimpse:
-    """The memory of one head from n vantages, at full size.
+class ImageGlimpse:
+    """The memory of the head image from n vantages, at full size.
 
     Attributes:
       image: float32 [n, H, W, 3] in [0, 1], the newest image moved, and `covered` [n, H, W, 1], 1 where it was seen.
+    """
+
+    image: Array
+    covered: Array
+
+
+@flax.struct.dataclass
+class RangeGlimpse:
+    """The memory of the head range_view from n vantages, at full size.
+
+    Attributes:
       moved_m, newest_m, still_m: float32 [n, Hr, Wr] ranges, -1 where nothing is: all scans moved, the newest moved,
         and the newest as it was.
       filled_m: float32 [n, Hr, Wr], moved_m with its small holes filled.
       sky: float32 [n, Hr, Wr], 1 where a pixel without a return came to lie.
       height_m: float32 [n, Hr, Wr], of the moved returns over the road.
+    """
+
+    moved_m: Array
+    newest_m: Array
+    still_m: Array
+    filled_m: Array
+    sky: Array
+    height_m: Array
+
+
+@flax.struct.dataclass
+class VoxelGlimpse:
+    """The memory of the head occupancy from n vantages, at full size.
+
+    Attributes:
       newest, older: float32 [n, X, Y, Z] in [-1, 1], evidence of the newest scan and of all before it.
     """
 
-    image: Array | None = None
-    covered: Array | None = None
-    moved_m: Array | None = None
-    newest_m: Array | None = None
-    still_m: Array | None = None
-    filled_m: Array | None = None
-    sky: Array | None = None
-    height_m: Array | None = None
-    newest: Array | None = None
-    older: Array | None = None
+    newest: Array
+    older: Array
+
+
+Glimpse = ImageGlimpse | RangeGlimpse | VoxelGlimpse
 
 
 def guessed_heads(config: ModelConfig) -> tuple[str, ...]:
@@ -71,12 +94,13 @@ def initial_vantage(config: ModelConfig, batch_size: int) -> Vantage:
     """Before anything was seen: no observation is remembered."""
     zeros = jnp.zeros((batch_size,), jnp.int32)
     standing = Motion(jnp.zeros((batch_size, 3), jnp.float32), jnp.zeros((batch_size,), jnp.float32))
-    return Vantage(standing, zeros + config.memory_frames, zeros + config.memory_frames - 1, zeros)
+    return Vantage(standing, zeros + config.memory_frames + 1, zeros + config.memory_frames, zeros)
 
 
 def intended(config: ModelConfig, vantage: Vantage, action: Array) -> Motion:
     """What an action [..., 2] does to the car in one step of the model, in the ego frame before it."""
     kinematics = config.kinematics
+    assert kinematics is not None  # callers ask where the car moves as the head ego_motion says
     standing = motion_ops.at_rest_of_frame(vantage.motion.speed_mps)
     return motion_ops.drive(standing, action, kinematics.contract, kinematics.periods)
 
@@ -84,7 +108,7 @@ def intended(config: ModelConfig, vantage: Vantage, action: Array) -> Motion:
 def moved_on(vantage: Vantage, step: Motion) -> Vantage:
     """After one imagined step, given in the ego frame before it."""
     motion = motion_ops.moved(vantage.motion, jnp.concatenate([step.pose, jnp.expand_dims(step.speed_mps, -1)], -1))
-    return vantage.replace(motion=motion, steps=vantage.steps + 1)
+    return dataclasses.replace(vantage, motion=motion, steps=vantage.steps + 1)
 
 
 def measured(config: ModelConfig, batch: Batch) -> Motion | None:
@@ -122,7 +146,8 @@ def of_window(config: ModelConfig, batch: Batch, states: LatentState,
     poses = motion_ops.relative(poses, jnp.broadcast_to(poses[:, -1:], poses.shape))
     index = jnp.broadcast_to(jnp.arange(frames, dtype=jnp.int32)[None], is_first.shape)
     first = jax.lax.cummax(jnp.where(is_first, index, 0), axis=1)
-    states = states.replace(vantage=Vantage(Motion(poses, speed_mps), first, index, jnp.zeros_like(index)))
+    vantage = Vantage(Motion(poses, speed_mps), first, index, jnp.zeros_like(index))
+    states = dataclasses.replace(states, vantage=vantage)
     return states, _remembered(config, batch, poses)
 
 
@@ -136,18 +161,21 @@ def _remembered(config: ModelConfig, batch: Batch, poses: Array) -> Memory | Non
 
 
 def empty(config: ModelConfig, batch_size: int) -> Memory | None:
-    """The memory of a stream before its first observation, of config.memory_frames places."""
+    """The memory of a stream before its first observation: config.memory_frames places and the newest one's.
+
+    That one is hidden from the decoders of its own state, which look at as many before it, as those of a window do.
+    """
     heads = guessed_heads(config)
     if not heads:
         return None
-    lead, view = (batch_size, config.memory_frames), config.range_view
+    lead, view = (batch_size, config.memory_frames + 1), config.range_view
     memory = Memory(jnp.zeros((*lead, 3), jnp.float32),
                     jnp.full((*lead, view.rows, view.columns, 4), -1.0, jnp.float32))
     if "image" not in heads:
         return memory
-    return memory.replace(image=jnp.zeros((*lead, *config.image_size, 3), jnp.uint8),
-                          intrinsics=jnp.zeros((batch_size, 3, 3), jnp.float32),
-                          camera_to_ego=jnp.zeros((batch_size, 4, 4), jnp.float32))
+    return dataclasses.replace(memory, image=jnp.zeros((*lead, *config.image_size, 3), jnp.uint8),
+                               intrinsics=jnp.zeros((batch_size, 3, 3), jnp.float32),
+                               camera_to_ego=jnp.zeros((batch_size, 4, 4), jnp.float32))
 
 
 def remember(memory: Memory, batch: Batch, step: Array) -> Memory:
@@ -157,12 +185,13 @@ def remember(memory: Memory, batch: Batch, step: Array) -> Memory:
     """
     append = lambda old, new: jnp.concatenate([old[:, 1:], jnp.asarray(new).astype(old.dtype)], axis=1)
     poses = motion_ops.relative(memory.pose, jnp.broadcast_to(step[:, None], memory.pose.shape))
-    memory = memory.replace(pose=append(poses, jnp.zeros_like(step)[:, None]),
-                            range_view=append(memory.range_view, batch.range_view))
+    memory = dataclasses.replace(memory, pose=append(poses, jnp.zeros_like(step)[:, None]),
+                                 range_view=append(memory.range_view, batch.range_view))
     if memory.image is None:
         return memory
-    return memory.replace(image=append(memory.image, batch.image), intrinsics=jnp.asarray(batch.intrinsics),
-                          camera_to_ego=jnp.asarray(batch.camera_to_ego))
+    return dataclasses.replace(
+        memory, image=append(memory.image, batch.image), intrinsics=jnp.asarray(batch.intrinsics),
+        camera_to_ego=jnp.asarray(batch.camera_to_ego))
 
 
 def check(config: ModelConfig, states: LatentState | Array, memory: Memory | None, rows: Array | None,
@@ -170,8 +199,8 @@ def check(config: ModelConfig, states: LatentState | Array, memory: Memory | Non
     """The flat vantage and rows of states [*lead, ...] that are decoded with a memory.
 
     Raises:
-      ValueError: if there is no vantage or no memory, the memory is of other sizes, or the states' first axis does not
-        count its drives.
+      ValueError: if there is no vantage or no memory, the memory is of other sizes, or neither `rows` nor the states'
+        first axis says which of its drives a state belongs to.
     """
     heads = ", ".join(guessed_heads(config))
     if not isinstance(states, LatentState) or states.vantage is None or memory is None:
@@ -180,16 +209,21 @@ def check(config: ModelConfig, states: LatentState | Array, memory: Memory | Non
         raise ValueError(f"decode: got {came}{' and no memory' if memory is None else ''}, but the heads {heads} of "
                          f"this model (first_guess='last_seen') look at what was seen of late. Pass states of "
                          f"`observe` or `imagine` and memory=observed.memory (live.memory of a stream).")
-    drives = memory.pose.shape[0]
+    drives, frames = memory.pose.shape[:2]
     for name, shape in inputs(config).items():
         value = getattr(memory, name)
-        if value is None or value.shape[-len(shape):] != shape or value.shape[0] != drives:
+        expected = (drives, *(() if name in UNTIMED_FIELDS else (frames,)), *shape)
+        if value is None or value.shape != expected:
             raise ValueError(f"decode: memory.{name} is {None if value is None else list(value.shape)}, expected "
-                             f"[{drives}, ..., {', '.join(map(str, shape))}]; this memory belongs to another model.")
+                             f"{list(expected)} beside memory.pose {list(memory.pose.shape)}; this memory belongs to "
+                             f"another model or is of two.")
     flat = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[len(lead):]), states.vantage)
     count = flat.last.shape[0]
     if rows is not None:
-        return flat, jnp.asarray(rows, jnp.int32).reshape(-1)
+        rows = jnp.asarray(rows, jnp.int32)
+        if rows.shape != lead:
+            raise ValueError(f"decode: got rows {list(rows.shape)}, expected {list(lead)}, a drive for each state.")
+        return flat, rows.reshape(-1)
     if (lead[0] if lead else 1) != drives:
         raise ValueError(f"decode: got states [{', '.join(map(str, (*lead, '...')))}] and a memory of {drives} drives; "
                          f"the first axis of the states must count the drives. Pass rows= otherwise.")
@@ -197,8 +231,11 @@ def check(config: ModelConfig, states: LatentState | Array, memory: Memory | Non
 
 
 def look(config: ModelConfig, memory: Memory, rows: Array, vantage: Vantage,
-         heads: tuple[str, ...]) -> dict[str, Glimpse]:
+         heads: tuple[str, ...]) -> tuple[dict[str, Glimpse], Array]:
     """The memory as it looks from n vantages, for those of the heads that it can tell something.
+
+    Beside it, `numbers` [n, 5]: how far the car is from where the newest observation in sight was taken (forward, left,
+    turn; zeros where there is none), how many steps are imagined and how fast it is; about 1 where that is much.
 
     Args:
       config: of the model.
@@ -208,8 +245,6 @@ def look(config: ModelConfig, memory: Memory, rows: Array, vantage: Vantage,
       heads: what is decoded.
     """
     heads = tuple(head for head in guessed_heads(config) if head in heads)
-    if not heads:
-        return {}
     places = config.memory_frames
     stop = vantage.last + (vantage.steps > 0)
     index = stop[:, None] + jnp.arange(-places, 0, dtype=jnp.int32)[None]
@@ -217,17 +252,19 @@ def look(config: ModelConfig, memory: Memory, rows: Array, vantage: Vantage,
     index = jnp.clip(index, 0, memory.pose.shape[1] - 1)
     pose = motion_ops.relative(jnp.broadcast_to(vantage.motion.pose[:, None], (*index.shape, 3)),
                                memory.pose[rows[:, None], index])
-    glimpses = {}
+    glimpses: dict[str, Glimpse] = {}
     if "occupancy" in heads:
         glimpses["occupancy"] = _evidence(config, memory, rows, index, known, pose)
     if "range_view" in heads or "image" in heads:
         glimpses["range_view"] = view = _ranges(config, memory, rows, index, known, pose)
         if "image" in heads:
             glimpses["image"] = _image(config, memory, rows, index[:, -1], known[:, -1], pose[:, -1], view)
-    return {head: glimpses[head] for head in heads}
+    apart = jnp.where(known[:, -1:], pose[:, -1], 0.0) / jnp.array([10.0, 2.0, 0.3], jnp.float32).reshape(1, 3)
+    numbers = [apart, vantage.steps.astype(jnp.float32)[:, None] / 5.0, vantage.motion.speed_mps[:, None] / 10.0]
+    return {head: glimpses[head] for head in heads}, jnp.concatenate(numbers, axis=-1)
 
 
-def _ranges(config: ModelConfig, memory: Memory, rows: Array, index: Array, known: Array, pose: Array) -> Glimpse:
+def _ranges(config: ModelConfig, memory: Memory, rows: Array, index: Array, known: Array, pose: Array) -> RangeGlimpse:
     geometry = config.range_view
     scans = memory.range_view[rows[:, None], index]
     scans = scans.reshape(*index.shape, -1, 4)
@@ -235,35 +272,36 @@ def _ranges(config: ModelConfig, memory: Memory, rows: Array, index: Array, know
     valid = (scans[..., 3] > 0.0) & jnp.expand_dims(known, -1)
     splat = lambda part: reproject.onto_beams(reproject.splat(
         points_m[:, part].reshape(len(rows), -1, 3), valid[:, part].reshape(len(rows), -1), geometry), geometry)
-    newest, older = splat(slice(-1, None)), splat(slice(None, -1))
-    moved = jnp.where(newest[..., 3:] > 0.0, newest, older)
+    moved = newest = splat(slice(-1, None))
+    if index.shape[1] > 1:
+        moved = jnp.where(newest[..., 3:] > 0.0, newest, splat(slice(None, -1)))
     still = scans[:, -1].reshape(*newest.shape)
     fresh = known[:, -1].reshape(-1, 1, 1)
     sky = reproject.move_sky(still, pose[:, -1], geometry) & fresh & (moved[..., 3] <= 0.0)
     filled_m = reproject.fill_holes(moved[..., 3], sky, geometry)
     still_m = jnp.where(fresh, still[..., 3], RANGE_NO_RETURN_M)
     height_m = jnp.where(moved[..., 3] > 0.0, moved[..., 2], 0.0)
-    return Glimpse(moved_m=moved[..., 3], newest_m=newest[..., 3], filled_m=filled_m, still_m=still_m,
-                   sky=sky.astype(jnp.float32), height_m=height_m)
+    return RangeGlimpse(moved_m=moved[..., 3], newest_m=newest[..., 3], filled_m=filled_m, still_m=still_m,
+                        sky=sky.astype(jnp.float32), height_m=height_m)
 
 
 def _image(config: ModelConfig, memory: Memory, rows: Array, index: Array, known: Array, pose: Array,
-           view: Glimpse) -> Glimpse:
+           view: RangeGlimpse) -> ImageGlimpse:
+    assert memory.image is not None and memory.intrinsics is not None and memory.camera_to_ego is not None  # see check
     images = memory.image.reshape(-1, *memory.image.shape[2:])
     moved, inside = reproject.move_image(images, view.filled_m, pose, memory.intrinsics[rows],
                                          memory.camera_to_ego[rows], config.range_view,
                                          rows * memory.image.shape[1] + index)
     covered = jnp.expand_dims((inside & known.reshape(-1, 1, 1)).astype(jnp.float32), -1)
-    return Glimpse(image=moved / 255.0 * covered, covered=covered)
+    return ImageGlimpse(image=moved / 255.0 * covered, covered=covered)
 
 
-def _evidence(config: ModelConfig, memory: Memory, rows: Array, index: Array, known: Array, pose: Array) -> Glimpse:
+def _evidence(config: ModelConfig, memory: Memory, rows: Array, index: Array, known: Array,
+              pose: Array) -> VoxelGlimpse:
     if memory.evidence is not None:
         both = reproject.move_voxels(memory.evidence, pose[:, -1], config.voxels, _wide(config.voxels), rows)
-        newest, older = jnp.split(both, 2, axis=-1)
-        return Glimpse(newest=newest, older=older)
-    newest, older = _scans_evidence(config, memory, rows, index, known, pose, config.voxels)
-    return Glimpse(newest=newest, older=older)
+        return VoxelGlimpse(*jnp.split(both, 2, axis=-1))
+    return VoxelGlimpse(*_scans_evidence(config, memory, rows, index, known, pose, config.voxels))
 
 
 def _scans_evidence(config: ModelConfig, memory: Memory, rows: Array, index: Array, known: Array, pose: Array,
@@ -284,13 +322,13 @@ def _scans_evidence(config: ModelConfig, memory: Memory, rows: Array, index: Arr
     return evidence[:, -1], jnp.clip((evidence[:, :-1] * weights).sum(axis=1), -1.0, 1.0)
 
 
-def with_evidence(config: ModelConfig, memory: Memory | None, vantage: Vantage) -> Memory | None:
+def with_evidence(config: ModelConfig, memory: Memory | None, vantage: Vantage | None) -> Memory | None:
     """The memory with the evidence for voxels worked out once, for many states that are imagined from its newest
     observation: a planner's. Resampled from there it is a little blurred, and ends half a grid beyond the grid.
 
-    vantage: [B], of the states from which imagination starts.
+    vantage: [B], of the states from which imagination starts; None where there is no memory.
     """
-    if memory is None or "occupancy" not in config.heads:
+    if memory is None or vantage is None or "occupancy" not in config.heads:
         return memory
     places, rows = config.memory_frames, jnp.arange(memory.pose.shape[0])
     index = jnp.broadcast_to(memory.pose.shape[1] + jnp.arange(-places, 0, dtype=jnp.int32)[None], (len(rows), places))
@@ -298,7 +336,7 @@ def with_evidence(config: ModelConfig, memory: Memory | None, vantage: Vantage) 
     index = jnp.maximum(index, 0)
     pose = motion_ops.relative(jnp.zeros((*index.shape, 3)), memory.pose[rows[:, None], index])
     evidence = _scans_evidence(config, memory, rows, index, known, pose, _wide(config.voxels))
-    return memory.replace(evidence=jnp.concatenate(evidence, axis=-1))
+    return dataclasses.replace(memory, evidence=jnp.concatenate(evidence, axis=-1))
 
 
 def _wide(grid: VoxelGrid) -> VoxelGrid:

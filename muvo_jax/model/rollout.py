@@ -82,8 +82,8 @@ def filter_embeddings(model: WorldModel, variables: Variables, embedding: jax.Ar
         state, (prior, posterior) = model.observe_step(variables, noise_t, state, action_t, embedding_t, is_first_t)
         deterministic = state.deterministic
         if speed_t is not None:
-            motion = state.vantage.motion.replace(speed_mps=speed_t)
-            state = state.replace(vantage=state.vantage.replace(motion=motion))
+            motion = dataclasses.replace(state.vantage.motion, speed_mps=speed_t)
+            state = dataclasses.replace(state, vantage=dataclasses.replace(state.vantage, motion=motion))
         return state, (deterministic, prior, posterior)
 
     inputs = jax.tree.map(_swap_time, (noise, previous, embedding, is_first, speed_mps))
@@ -115,11 +115,11 @@ def observe_window(model: WorldModel, variables: Variables, batch: Batch, keys: 
         noise = mean_mode(noise)
     moved = memory_lib.measured(model.config, batch) if model.config.tracks_motion else None
     observed = filter_embeddings(model, variables, embedding, batch.action, batch.is_first, noise,
-                                 moved and moved.speed_mps)
+                                 None if moved is None else moved.speed_mps)
     if model.config.tracks_motion:
         moved = moved or memory_lib.from_arrivals(model.ego_motion(variables, observed.states))
         states, remembered = memory_lib.of_window(model.config, batch, observed.states, moved)
-        observed = observed.replace(states=states, memory=remembered)
+        observed = dataclasses.replace(observed, states=states, memory=remembered)
     return observed, batch_stats
 
 

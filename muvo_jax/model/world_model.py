@@ -101,8 +101,9 @@ class Network(linen.Module):
     def imagine_step(self, noise: jax.Array, state: LatentState, action: jax.Array) -> tuple[LatentState, Gaussian]:
         following, prior = self.transition.imagine_step(noise, state, action)
         if self.config.tracks_motion and self.config.kinematics is None:
-            step = self.ego_motion(following.features)
-            following = following.replace(vantage=memory_lib.moved_on(state.vantage, step))
+            assert state.vantage is not None  # of a model that tracks its motion
+            vantage = memory_lib.moved_on(state.vantage, self.ego_motion(following.features))
+            following = dataclasses.replace(following, vantage=vantage)
         return following, prior
 
     def ego_motion(self, features: jax.Array) -> Motion:
@@ -113,12 +114,16 @@ class Network(linen.Module):
 
     def decode(self, features: jax.Array, vantage: Vantage | None, memory: Memory | None, rows: jax.Array | None,
                names: tuple[str, ...]) -> dict[str, dict[int, jax.Array]]:
-        glimpses = {} if memory is None else memory_lib.look(self.config, memory, rows, vantage, names)
+        glimpses: dict[str, memory_lib.Glimpse] = {}
+        numbers = None
+        if memory is not None:
+            assert vantage is not None and rows is not None  # as memory.check returns them
+            glimpses, numbers = memory_lib.look(self.config, memory, rows, vantage, names)
         raw = {}
         for name in names:
             read = self.read(features, name)
             if name in glimpses:
-                raw[name] = self.decoders[name](read, glimpses[name], guided.numbers(vantage), self.first_guess[name])
+                raw[name] = self.decoders[name](read, glimpses[name], numbers, self.first_guess[name])
             else:
                 raw[name] = self.decoders[name](read)
                 if self.config.first_guess != "zero" and name in self.first_guess:
@@ -148,6 +153,13 @@ class WorldModel:
     """
 
     config: ModelConfig
+
+    def __post_init__(self):
+        config = self.config
+        if config.tracks_motion and config.kinematics is None and "ego_motion" not in config.heads:
+            raise ValueError(f"model.first_guess=last_seen moves what was seen as the car moves, but model.kinematics "
+                             f"is None and the heads are {', '.join(config.heads)}. Take the model of a Config whose "
+                             f"contract.kinematics is 'bicycle' (Config.model), or add the head ego_motion.")
 
     @property
     def feature_shape(self) -> tuple[int, ...]:

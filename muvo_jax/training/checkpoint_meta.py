@@ -52,10 +52,13 @@ def _encode(data_state):
 
 
 def check_architecture(wanted: config_lib.Config, stored: config_lib.Config, where: str) -> None:
-    """Raises ValueError naming both where the two configs describe different networks."""
-    if wanted.model == stored.model:
+    """Raises ValueError naming both where the two configs describe different networks.
+
+    What an action does (model.kinematics) is the recording's, not the network's.
+    """
+    ours, theirs = (dataclasses.asdict(config.model) | {"kinematics": None} for config in (wanted, stored))
+    if ours == theirs:
         return
-    ours, theirs = dataclasses.asdict(wanted.model), dataclasses.asdict(stored.model)
     fields = [f"{name} {theirs[name]!r} (stored) against {ours[name]!r} (asked for)"
               for name in ours if ours[name] != theirs[name]]
     raise ValueError(f"{where} holds another architecture: it is {stored.model.variant} of preset {stored.preset!r}, "

@@ -202,11 +202,11 @@ def forward(params: Any, batch_stats: Any, batch: types.Batch, keys: types.Array
     if train:
         shown = augmentation.augment(shown, keys, config.augmentation)
         if config.train.restart:
-            shown = shown.replace(is_first=_restarted(shown.is_first, keys))
+            shown = dataclasses.replace(shown, is_first=_restarted(shown.is_first, keys))
     observed, batch_stats = maybe_remat(observe)(variables, shown, keys)
     states, memory = observed.states, observed.memory
     if memory is not None and memory.image is not None:  # not augmented: the target is not either
-        memory = memory.replace(image=jnp.asarray(batch.image)[:, :seen])
+        memory = dataclasses.replace(memory, image=jnp.asarray(batch.image)[:, :seen])
     if train:
         states = _and_imagined(model, variables, observed, batch.action, keys)
         states, batch = _some_frames(states, batch, keys, config.train.decode_frames)

@@ -92,8 +92,8 @@ def test_the_planner_filters_every_step_plans_for_progress_and_compiles_once():
     assert planned.progress_m > coasting.progress_m  # at 5 m/s, half the limit, imagination pays for accelerating
     again = run(world, driver, steps=6, context=3)
     assert again.progress_m == planned.progress_m
-    states, plans = closed_loop.latents(planned.moments)
-    assert plans.shape == (6, 4, 2) and states.features.shape[0] == 6
+    states, memory, plans = closed_loop.latents(planned.moments)
+    assert plans.shape == (6, 4, 2) and states.features.shape[0] == 6 and memory is None
 
 
 @pytest.mark.parametrize(("options", "message"), [

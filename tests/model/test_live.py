@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from muvo_jax import config as config_lib
 from muvo_jax import presets
 from muvo_jax.model import live, rollout, world_model
 from muvo_jax.types import BATCH_FIELDS, Batch
@@ -38,6 +39,26 @@ def test_a_stream_ends_where_the_window_ends():
         np.testing.assert_allclose(stream.latent.features, observed.states[:, t].features, atol=1e-5)
     assert live._observe_step._cache_size() == before + 1
     assert stream.frame.tolist() == [3]
+
+
+def test_a_stream_with_memory_may_start_from_zeros():
+    """A sealed model's consumer knows shapes alone."""
+    model = world_model.WorldModel(dataclasses.replace(CONFIG, first_guess="last_seen", heads=("range_view",),
+                                                       kinematics=config_lib.Kinematics()))
+    variables, batch = jax.tree.map(jnp.asarray, model.init(jax.random.key(0))), make_batch(2)
+    begun = live.start_live(model, jax.random.key(7))
+    zeros = dataclasses.replace(begun, **{name: jax.tree.map(jnp.zeros_like, getattr(begun, name))
+                                          for name in ("latent", "frame", "memory")})
+    ends = []
+    for stream in (begun, zeros):
+        for t in range(2):
+            seen = {name: getattr(batch, name)[:, t] for name in INPUTS}
+            stream = live.observe_step(model, variables, stream, seen, batch.action[:, 0])
+        ends.append(stream)
+    assert (int(ends[0].latent.vantage.first[0]), int(ends[0].latent.vantage.last[0])) == (4, 5)
+    jax.tree.map(np.testing.assert_array_equal, ends[0].latent, ends[1].latent)
+    views = [rollout.decode(model, variables, end.latent, memory=end.memory).range_view for end in ends]
+    np.testing.assert_array_equal(*views)
 
 
 @pytest.mark.parametrize(("lidar", "camera"), [("pp", "wob"), ("rv", "bev")])

@@ -92,7 +92,9 @@ class SmallWorld:
     def imagine_step(self, variables, *args):
         return SmallNetwork(self.config).apply(variables, *args, method="imagine_step")
 
-    def decode(self, variables, features, heads=None):
+    def decode(self, variables, states, heads=None, memory=None, rows=None):
+        assert memory is None and rows is None, "the small world has no geometric memory"
+        features = states.features if isinstance(states, types.LatentState) else states
         names = self.config.heads if heads is None else heads
         return types.Predictions(SmallNetwork(self.config).apply(variables, features, names, method="decode"))
 

@@ -298,7 +298,7 @@ def test_expected_batch_is_what_the_pipeline_makes():
     recording = MemoryRecording()
     config = prepare.adapt(_config(), recording).config
     batch = next(pipeline.train_batches(pipeline.Frames(recording, config), seed=0, batch=2))
-    expected = preparation.expected_batch(config, 2, rewards=False)
+    expected = preparation.expected_batch(config, 2, recorded=recording.description.modalities)
     assert jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype), batch) == expected
 
 

@@ -208,7 +208,7 @@ def test_imagined_frames_follow_from_the_last_observed_one():
     model, config, batch, state = setting(heads=FEW)
     keys = step_lib.sample_keys(jax.random.key(1), 0, 0, small_world.WINDOWS, None)
     observed, _ = rollout.observe_window(model, state.variables, batch.time_slice(0, 2), keys, train=True)
-    features = step_lib._and_imagined(model, state.variables, observed, batch.action, keys)
+    features = step_lib._and_imagined(model, state.variables, observed, batch.action, keys).features
     # By hand: action[1] leads from the last observed frame, 1, to frame 2; h does not depend on the noise.
     noise = jnp.zeros_like(observed.last.stochastic)
     expected, _ = model.imagine_step(state.variables, noise, observed.last, batch.action[:, 1])

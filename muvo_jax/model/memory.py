@@ -90,11 +90,20 @@ def inputs(config: ModelConfig) -> dict[str, tuple[int, ...]]:
     return fields
 
 
+def stream_places(config: ModelConfig) -> int:
+    """Observations that a stream remembers: those that decoders look at, and the newest.
+
+    That one is hidden from the decoders of its own state, which look at as many before it, as those of a window do.
+    """
+    return config.memory_frames + 1
+
+
 def initial_vantage(config: ModelConfig, batch_size: int) -> Vantage:
     """Before anything was seen: no observation is remembered."""
     zeros = jnp.zeros((batch_size,), jnp.int32)
     standing = Motion(jnp.zeros((batch_size, 3), jnp.float32), jnp.zeros((batch_size,), jnp.float32))
-    return Vantage(standing, zeros + config.memory_frames + 1, zeros + config.memory_frames, zeros)
+    places = stream_places(config)
+    return Vantage(standing, zeros + places, zeros + places - 1, zeros)
 
 
 def intended(config: ModelConfig, vantage: Vantage, action: Array) -> Motion:
@@ -161,14 +170,11 @@ def _remembered(config: ModelConfig, batch: Batch, poses: Array) -> Memory | Non
 
 
 def empty(config: ModelConfig, batch_size: int) -> Memory | None:
-    """The memory of a stream before its first observation: config.memory_frames places and the newest one's.
-
-    That one is hidden from the decoders of its own state, which look at as many before it, as those of a window do.
-    """
+    """The memory of a stream before its first observation."""
     heads = guessed_heads(config)
     if not heads:
         return None
-    lead, view = (batch_size, config.memory_frames + 1), config.range_view
+    lead, view = (batch_size, stream_places(config)), config.range_view
     memory = Memory(jnp.zeros((*lead, 3), jnp.float32),
                     jnp.full((*lead, view.rows, view.columns, 4), -1.0, jnp.float32))
     if "image" not in heads:

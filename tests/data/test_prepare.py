@@ -65,7 +65,7 @@ def test_sequences_shorter_than_the_window(tmp_path):
     with pytest.raises(schema.DataError, match="'val_rl' has 7 frames, but a window of 8 frames at stride 1 needs 8"):
         prepare.adapt(presets.get("town"), recording)
     keep = {"data.frames", "data.stride"}
-    with pytest.raises(schema.DataError, match="'train' has 9 frames, but a window of 8 frames at stride 2 needs 15"):
+    with pytest.raises(schema.DataError, match="'train' has 9 frames, but a window of 12 frames at stride 2 needs 23"):
         prepare.adapt(presets.get("town"), recording, keep=keep)
 
 

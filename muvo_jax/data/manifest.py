@@ -6,11 +6,12 @@ import dataclasses
 import hashlib
 import json
 import pathlib
+import warnings
 from typing import Any
 
 from muvo_jax import config as config_lib
 from muvo_jax.data import description as description_lib
-from muvo_jax.data import files, schema
+from muvo_jax.data import fields, files, schema
 
 SCHEMA_VERSION = 1
 MANIFEST_FILE = "manifest.json"
@@ -81,12 +82,15 @@ def entry_fault(entry: Any) -> str | None:
 
 
 def _sequence_fault(sequence: Any) -> str | None:
-    if not isinstance(sequence, dict) or set(sequence) != {"split", "name", "start", "length"}:
-        return "expected split, name, start and length"
+    if not isinstance(sequence, dict) or set(sequence) - {"lacks"} != {"split", "name", "start", "length"}:
+        return "expected split, name, start and length, and lacks where its frames lack fields"
     if not (isinstance(sequence["split"], str) and isinstance(sequence["name"], str)):
         return "split and name must be text"
     if not (is_count(sequence["start"]) and is_count(sequence["length"], least=1)):
         return f"start {str(sequence['start'])[:80]} and length {str(sequence['length'])[:80]} must be whole numbers"
+    lacks = sequence.get("lacks", [])
+    if not isinstance(lacks, list) or not all(isinstance(name, str) and name in fields.FIELDS for name in lacks):
+        return f"lacks is {str(lacks)[:80]}, expected a list of recorded fields"
     return None
 
 
@@ -114,6 +118,13 @@ def file_sha256(path: pathlib.Path) -> str:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
+def describe_sequence(sequence: schema.Sequence) -> dict:
+    """The JSON form of a sequence, schema.Sequence(**it) again; `lacks` is left out where it is empty."""
+    values = dataclasses.asdict(sequence)
+    lacks = values.pop("lacks")
+    return values | ({"lacks": list(lacks)} if lacks else {})
+
+
 def describe(description: schema.RecordingDescription) -> dict:
     """The JSON form of a description, without its kind."""
     values = dataclasses.asdict(description)
@@ -124,13 +135,18 @@ def describe(description: schema.RecordingDescription) -> dict:
 def read_description(manifest: dict, path: pathlib.Path) -> schema.RecordingDescription:
     """The inverse of `describe`; `path` of the manifest is for messages.
 
+    Older manifests do not say the scale of their route maps: the default is assumed, with a warning.
+
     Raises:
       DataError: where it is malformed.
     """
     try:
-        values = dict(manifest["description"])
-        sections = {name: description_lib.section({name: values[name]} if values.get(name) else {}, name, path,
-                                                  required=False) for name in ("camera", "lidar", "voxels")}
+        values = {"route_map": None} | manifest["description"]
+        sections = {name: description_lib.section({name: values[name]} if values[name] else {}, name, path,
+                                                  required=False)
+                    for name in ("camera", "lidar", "voxels", "route_map")}
+        if "route_map" in values["modalities"] and sections["route_map"] is None:
+            sections["route_map"] = _assumed_route_map(path)
         contract = config_lib.parse(config_lib.ActionContract, values["contract"], f"{path}: contract")
         return schema.RecordingDescription(
             name=values["name"], kind=f"packed {values['kind']}", rate_hz=values["rate_hz"], contract=contract,
@@ -138,3 +154,11 @@ def read_description(manifest: dict, path: pathlib.Path) -> schema.RecordingDesc
             classes=tuple(values.get("classes", ())), **sections)
     except _MALFORMED as error:
         raise schema.DataError(f"{path}: description is malformed ({error}). Pack the recording again.") from error
+
+
+def _assumed_route_map(path: pathlib.Path) -> config_lib.RouteMap:
+    assumed = config_lib.RouteMap()
+    warnings.warn(f"{path}: does not say the scale of its route maps; {assumed.metres_per_px:g} m a pixel is assumed, "
+                  f"as the built-in town draws them. Pack a recording of another scale again.", schema.DataWarning,
+                  stacklevel=4)
+    return assumed

@@ -139,7 +139,8 @@ class PackedRecording:
         for sequence in whole:
             for start, stop in self._present(record, record + sequence.length, damaged):
                 begin = sequence.start + start - record
-                kept.append(dataclasses.replace(sequence, start=begin, length=stop - start))
+                kept.append(dataclasses.replace(sequence, start=begin, length=stop - start,
+                                                lacks=tuple(sorted(set(sequence.lacks) - self._unwanted))))
                 self._first[(sequence.name, begin)] = start
             record += sequence.length
         self.sequences = tuple(kept)
@@ -149,7 +150,9 @@ class PackedRecording:
             warnings.warn(f"{self._root}: {len(damaged)} of {len(self._shards)} shards are damaged and skipped, "
                           f"{lost} of {record} frames are lost: {names}.", schema.DataWarning, stacklevel=2)
         described = manifest_lib.read_description(manifest, self._root / manifest_lib.MANIFEST_FILE)
-        self.description = dataclasses.replace(described, modalities=described.modalities - self._unwanted)
+        is_asked = not self._unwanted >= {"image_classes", "point_classes"}
+        self.description = dataclasses.replace(described, modalities=described.modalities - self._unwanted,
+                                               classes=described.classes if is_asked else ())
 
     def _present(self, first: int, end: int, damaged: Collection[int]) -> Iterator[tuple[int, int]]:
         """(start, stop) of the records from `first` to `end` that lie in whole shards, without a gap each."""

@@ -17,7 +17,6 @@ from array_record.python import array_record_module
 from muvo_jax.data import fingerprints, manifest, processes, recorder, records, schema, sources
 
 PLAN_FILE = "plan.json"
-_LIST_FIELDS = ("split", "name", "start", "length")
 _CORRECTED = ("sequences", "frames_of_splits")  # what of a plan a corrected source may change
 
 Progress = Callable[[int, int], None]
@@ -134,7 +133,7 @@ def _check_apart(source: pathlib.Path, out: pathlib.Path) -> None:
 
 def _plan(recording: schema.Recording, frames_per_shard: int, encoding: records.Encoding) -> dict:
     described = recording.description
-    sequences = [{name: getattr(sequence, name) for name in _LIST_FIELDS} for sequence in recording.sequences]
+    sequences = [manifest.describe_sequence(sequence) for sequence in recording.sequences]
     counts = {split: sum(sequence.length for sequence in recording.sequences if sequence.split == split)
               for split in described.splits}
     return {"schema_version": manifest.SCHEMA_VERSION, "description": manifest.describe(described),

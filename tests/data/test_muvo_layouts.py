@@ -1,5 +1,6 @@
 """The MUVO layout as other people leave it: other suffixes and separators, lost rows, tags of newer simulators."""
 
+import dataclasses
 import shutil
 
 import numpy as np
@@ -18,6 +19,7 @@ from muvo_jax.data import (
     plain,
     recorder,
     schema,
+    shards,
     sources,
 )
 
@@ -38,10 +40,13 @@ def write_run(folder, *, numbers=range(FRAMES), tags=None, suffix=".png", table_
             Image.fromarray(np.full((32, 64, 3), number, np.uint8)).save(folder / f"image/image_{number:09d}{suffix}")
         if tags is not None:
             write_scan(folder, number, tags)
+        if "routemap" in kinds:
+            Image.fromarray(np.full((192, 192), number, np.uint8)).save(folder / f"routemap/routemap_{number:09d}.png")
     count = len(rows)
     columns = {"action": [np.array([0.3, 0.1, 0.0], np.float32)] * count, "reward": np.ones(count),
                "speed": [np.array([8.0], np.float32)] * count}
-    names = {"image": table_suffix, **({"points_semantic": ".npy"} if tags is not None else {})}
+    names = {"image": table_suffix, **({"points_semantic": ".npy"} if tags is not None else {}),
+             **({"routemap": ".png"} if "routemap" in kinds else {})}
     columns |= {f"{kind}_path": [f"{kind}{separator}{kind}_{number:09d}{ending}" for number in rows]
                 for kind, ending in names.items()}
     (folder / carla_runs.FRAME_FILE).write_bytes(frame_pickle.frame(columns))
@@ -179,6 +184,20 @@ def test_one_run_with_more_files_takes_no_run_away(tmp_path):
     with pytest.warns(schema.DataWarning, match=r"image is missing in 1 of 3 runs"):
         recording = sources.open_recording(root)
     assert [sequence.lacks for sequence in recording.sequences] == [(), ("image",), ()]
+
+
+@pytest.mark.parametrize(("text", "expected"), [
+    ("", carla.ROUTE_MAP),
+    ("[route_map]\nmetres_per_px = 0.25\nego_row = 40\nego_column = 30\n", config_lib.RouteMap(0.25, 40.0, 30.0))])
+def test_a_pack_keeps_the_scale_of_the_route_maps(tmp_path, text, expected):
+    root = layout(tmp_path / "rec", kinds=("image", "routemap"))
+    (root / "sensors.toml").write_text(text)
+    assert shards.pack(root, tmp_path / "out", workers=1)
+    source, packed = sources.open_recording(root), sources.open_recording(tmp_path / "out")
+    assert packed.description == dataclasses.replace(source.description, kind="packed MUVO CARLA")
+    assert packed.description.route_map == expected and packed.sequences == source.sequences
+    sequence = packed.sequences[-1]
+    np.testing.assert_array_equal(packed.read(sequence, 3)["route_map"], source.read(sequence, 3)["route_map"])
 
 
 def test_an_export_says_the_weather_and_the_town_of_each_run(tmp_path):

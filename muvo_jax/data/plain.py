@@ -106,12 +106,11 @@ class PlainRecording:
         if contract is None:
             raise schema.DataError(f"{toml_path}: section [action] is missing; it says what actions mean.")
         section = lambda name, needed: description.section(header, name, toml_path, required=needed)
-        has_axis = lambda axis: any(axis in fields.FIELDS[name].shape for name in modalities)
-        voxels = section("voxels", True) if has_axis("X") else None  # [voxels] alone says what to make
+        in_voxels = any("X" in fields.FIELDS[name].shape for name in modalities)
+        voxels = section("voxels", True) if in_voxels else None  # [voxels] alone says what to make
         self.description = schema.RecordingDescription(
             name=str(description.field(header, "name", str, toml_path)), kind="plain", rate_hz=rate_hz,
-            camera=section("camera", has_axis("H")),
-            lidar=section("lidar", "points_m" in modalities),
+            camera=section("camera", "image" in modalities), lidar=section("lidar", "points_m" in modalities),
             voxels=voxels, contract=contract, splits=splits,
             modalities=modalities | (set(_OF_IMAGE) if "image" in modalities else set()),
             classes=self._class_names if labels & {"image_classes", "point_classes"} else (),
@@ -175,7 +174,7 @@ class PlainRecording:
             values = files.read_image(path, _MODES[name])
             values = decode_depth(values) if name == "depth_m" else values
         camera, grid = described.camera, described.voxels
-        sizes: dict[str, int | None] = {"N": None}
+        sizes: dict[str, int | None] = dict.fromkeys("HWNXYZ")
         if camera is not None:
             sizes |= {"H": camera.height_px, "W": camera.width_px}
         if grid is not None:

@@ -117,7 +117,7 @@ def initial_constants(config: ModelConfig) -> dict[str, float]:
             continue
         for scale in head.scales:
             path = f"decoders_{name}/{'decoder/' if name in guessed else ''}head_{scale}"
-            if name in guessed and scale == 1:
+            if name in guessed and name == "image" and scale == 1:
                 values[f"decoders_{name}/decoder/blur/kernel"] = 0.0
             if config.first_guess != "zero" and name in outputs.FIRST_GUESS_HEADS:
                 values |= {f"{path}/bias": 0.0, f"{path}/kernel": 0.0}

@@ -96,7 +96,7 @@ def _observe_step(model, variables, live, batch, sampled):
         return LiveState(latent, live.keys, live.frame + 1)
     before = live.latent.vantage
     step, speed_mps = _measured(model, variables, batch, before, latent)
-    still, places = Motion(jnp.zeros_like(before.motion.pose), speed_mps), model.config.memory_frames + 1
+    still, places = Motion(jnp.zeros_like(before.motion.pose), speed_mps), memory_lib.stream_places(model.config)
     # Counted from the frame's number, so that a stream may start from zeros (muvo_jax.export).
     first = jnp.maximum(jnp.where(batch.is_first[:, 0], places, before.first) - 1, 0)
     vantage = Vantage(still, first, jnp.full_like(first, places - 1), jnp.zeros_like(first))

@@ -90,11 +90,20 @@ def inputs(config: ModelConfig) -> dict[str, tuple[int, ...]]:
     return fields
 
 
+def stream_places(config: ModelConfig) -> int:
+    """Observations that a stream remembers: those that decoders look at, and the newest.
+
+    That one is hidden from the decoders of its own state, which look at as many before it, as those of a window do.
+    """
+    return config.memory_frames + 1
+
+
 def initial_vantage(config: ModelConfig, batch_size: int) -> Vantage:
     """Before anything was seen: no observation is remembered."""
     zeros = jnp.zeros((batch_size,), jnp.int32)
     standing = Motion(jnp.zeros((batch_size, 3), jnp.float32), jnp.zeros((batch_size,), jnp.float32))
-    return Vantage(standing, zeros + config.memory_frames + 1, zeros + config.memory_frames, zeros)
+    places = stream_places(config)
+    return Vantage(standing, zeros + places, zeros + places - 1, zeros)
 
 
 def intended(config: ModelConfig, vantage: Vantage, action: Array) -> Motion:
@@ -161,14 +170,11 @@ def _remembered(config: ModelConfig, batch: Batch, poses: Array) -> Memory | Non
 
 
 def empty(config: ModelConfig, batch_size: int) -> Memory | None:
-    """The memory of a stream before its first observation: config.memory_frames places and the newest one's.
-
-    That one is hidden from the decoders of its own state, which look at as many before it, as those of a window do.
-    """
+    """The memory of a stream before its first observation."""
     heads = guessed_heads(config)
     if not heads:
         return None
-    lead, view = (batch_size, config.memory_frames + 1), config.range_view
+    lead, view = (batch_size, stream_places(config)), config.range_view
     memory = Memory(jnp.zeros((*lead, 3), jnp.float32),
                     jnp.full((*lead, view.rows, view.columns, 4), -1.0, jnp.float32))
     if "image" not in heads:
@@ -271,7 +277,7 @@ def _ranges(config: ModelConfig, memory: Memory, rows: Array, index: Array, know
     points_m = motion_ops.into_frame(scans[..., :3], pose)
     valid = (scans[..., 3] > 0.0) & jnp.expand_dims(known, -1)
     splat = lambda part: reproject.onto_beams(reproject.splat(
-        points_m[:, part].reshape(len(rows), -1, 3), valid[:, part].reshape(len(rows), -1), geometry), geometry)
+        points_m[:, part].reshape(rows.shape[0], -1, 3), valid[:, part].reshape(rows.shape[0], -1), geometry), geometry)
     moved = newest = splat(slice(-1, None))
     if index.shape[1] > 1:
         moved = jnp.where(newest[..., 3:] > 0.0, newest, splat(slice(None, -1)))
@@ -314,9 +320,9 @@ def _scans_evidence(config: ModelConfig, memory: Memory, rows: Array, index: Arr
     flat_pose = pose.reshape(-1, 3)
     scans_m = memory.range_view[..., 3].reshape(-1, view.rows, view.columns)
     evidence = reproject.scan_evidence(scans_m, (rows[:, None] * frames + index).reshape(-1), flat_pose, grid, view)
-    scans = memory.range_view[rows[:, None], index].reshape(len(flat_pose), -1, 4)
+    scans = memory.range_view[rows[:, None], index].reshape(flat_pose.shape[0], -1, 4)
     hits = reproject.hit_voxels(motion_ops.into_frame(scans[..., :3], flat_pose), scans[..., 3] > 0.0, grid)
-    evidence = jnp.where(hits > 0.0, 1.0, evidence).reshape(len(rows), places, *grid.shape)
+    evidence = jnp.where(hits > 0.0, 1.0, evidence).reshape(rows.shape[0], places, *grid.shape)
     evidence = jnp.where(known.reshape(*known.shape, 1, 1, 1), evidence, 0.0)
     weights = FADE ** jnp.arange(places - 2, -1, -1, dtype=jnp.float32).reshape(1, -1, 1, 1, 1)
     return evidence[:, -1], jnp.clip((evidence[:, :-1] * weights).sum(axis=1), -1.0, 1.0)
@@ -331,7 +337,8 @@ def with_evidence(config: ModelConfig, memory: Memory | None, vantage: Vantage |
     if memory is None or vantage is None or "occupancy" not in config.heads:
         return memory
     places, rows = config.memory_frames, jnp.arange(memory.pose.shape[0])
-    index = jnp.broadcast_to(memory.pose.shape[1] + jnp.arange(-places, 0, dtype=jnp.int32)[None], (len(rows), places))
+    newest = memory.pose.shape[1] + jnp.arange(-places, 0, dtype=jnp.int32)
+    index = jnp.broadcast_to(newest[None], (rows.shape[0], places))
     known = (index >= vantage.first[:, None]) & (index >= 0)
     index = jnp.maximum(index, 0)
     pose = motion_ops.relative(jnp.zeros((*index.shape, 3)), memory.pose[rows[:, None], index])

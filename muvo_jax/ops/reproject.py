@@ -46,7 +46,7 @@ def splat(points_m: Array, valid: Array, geometry: RangeViewGeometry) -> Array:
     ranges = jax.lax.stop_gradient(range_m).reshape(-1)
     nearest = jnp.full((count * (cells + 1),), jnp.inf, jnp.float32).at[pixel].min(ranges)
     wins = ranges == nearest[pixel]
-    number = jnp.tile(jnp.arange(points, dtype=jnp.int32), count)
+    number = jnp.broadcast_to(jnp.arange(points, dtype=jnp.int32)[None], valid.shape).reshape(-1)
     winner = jnp.full((count * (cells + 1),), -1, jnp.int32).at[pixel].max(jnp.where(wins, number, -1))
     winner = winner.reshape(count, cells + 1)[:, :cells]
     seen = jnp.concatenate([points_m, jnp.expand_dims(range_m, -1)], axis=-1)

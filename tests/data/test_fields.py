@@ -101,6 +101,17 @@ def test_every_field_is_written_and_read_bit_for_bit(tmp_path_factory, frame):
     assert_same(records.decode_frame(records.encode_frame(read, records.Encoding()), "memory"), read)
 
 
+def test_a_run_may_have_one_of_the_masks_that_share_a_file(tmp_path):
+    moving = np.zeros((4, 5, 3), bool)
+    moving[1, 2, 0] = True
+    frame = {"frame_id": 0, "timestamp_s": 0.0, "speed_mps": 1.0, "acceleration": 0.0, "steering": 0.0,
+             "points_m": np.ones((7, 3), np.float32), "occupancy_moving_mask": moving}
+    recording = copy(tmp_path, [frame])
+    read = recording.read(recording.sequences[0], 0)
+    np.testing.assert_array_equal(read["occupancy_moving_mask"], moving)
+    assert "image_moving_mask" not in recording.description.modalities | read.keys()
+
+
 def test_kitti_and_packs_are_copied_bit_for_bit(tmp_path):
     sources_ = {"kitti": kitti.KittiRecording(writers.write_kitti(tmp_path / "kitti"))}
     shards.pack(writers.write_plain(tmp_path / "plain"), tmp_path / "packed", workers=1)

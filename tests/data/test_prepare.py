@@ -64,9 +64,9 @@ def test_sequences_shorter_than_the_window(tmp_path):
     recording = plain.PlainRecording(writers.write_plain(tmp_path, {"train/a": 9, "val_rl/b": 7}))
     with pytest.raises(schema.DataError, match="'val_rl' has 7 frames, but a window of 8 frames at stride 1 needs 8"):
         prepare.adapt(presets.get("town"), recording)
-    keep = {"data.frames", "data.stride"}
+    keep = {"data.frames": 8, "data.stride": 2}
     with pytest.raises(schema.DataError, match="'train' has 9 frames, but a window of 8 frames at stride 2 needs 15"):
-        prepare.adapt(presets.get("town"), recording, keep=keep)
+        prepare.adapt(config_lib.override_all(presets.get("town"), keep), recording, keep=keep)
 
 
 def test_recorded_voxels_route_and_contract_are_used(plain_recording):

@@ -55,7 +55,7 @@ def test_a_stream_with_memory_may_start_from_zeros():
             seen = {name: getattr(batch, name)[:, t] for name in INPUTS}
             stream = live.observe_step(model, variables, stream, seen, batch.action[:, 0])
         ends.append(stream)
-    assert (int(ends[0].latent.vantage.first[0]), int(ends[0].latent.vantage.last[0])) == (4, 5)
+    assert (int(ends[0].latent.vantage.first[0]), int(ends[0].latent.vantage.last[0])) == (5, 6)
     jax.tree.map(np.testing.assert_array_equal, ends[0].latent, ends[1].latent)
     views = [rollout.decode(model, variables, end.latent, memory=end.memory).range_view for end in ends]
     np.testing.assert_array_equal(*views)

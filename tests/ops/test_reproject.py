@@ -193,6 +193,25 @@ def test_voxels_that_stand_still_are_themselves_and_those_far_away_are_nothing()
     np.testing.assert_array_equal(move_voxels(values, pose(1e6, -1e6, 40.0), GRID), 0.0)
 
 
+def test_of_several_views_each_result_looks_at_the_one_that_is_named():
+    values = np.random.default_rng(0).random((2, *GRID.shape), np.float32)
+    where, which = jnp.concatenate([pose(1.0, 0.5, 0.1), pose(0.2, 0.0, 0.0), STILL]), jnp.array([1, 1, 0])
+    chosen = reproject.move_voxels(values, where, GRID, which=which)
+    np.testing.assert_allclose(chosen, reproject.move_voxels(values[np.asarray(which)], where, GRID), atol=1e-6)
+    images, scan = np.random.default_rng(0).random((2, *SIZE, 3), np.float32), wall()[..., 3]
+    repeat = lambda array, count: np.stack([array] * count)
+    calibration = (repeat(INTRINSICS, 3), repeat(CAMERA, 3), GEOMETRY)
+    got, _ = reproject.move_image(images, repeat(scan, 3), where, *calibration, which)
+    want, _ = reproject.move_image(images[np.asarray(which)], repeat(scan, 3), where, *calibration)
+    np.testing.assert_allclose(got, want, atol=1e-6)
+
+
+def test_a_voxel_with_a_return_in_it_is_hit():
+    points_m = np.array([[[-5.5, -4.5, -0.5], [5.9, 4.9, 2.9], [0.0, 0.0, 0.0], [6.1, 0.0, 0.0]]], np.float32)
+    hits = reproject.hit_voxels(points_m, np.array([[True, True, False, True]]), GRID)[0]
+    assert np.argwhere(hits).tolist() == [[0, 0, 0], [11, 9, 3]]
+
+
 def test_a_scan_frees_what_it_looks_through_hits_the_wall_and_says_nothing_behind_it():
     grid = VoxelGrid((24, 3, 1), 1.0, (-2.0, -1.5, 1.5))  # a row of voxels ahead, at the height of the lidar
     which = jnp.zeros((2,), jnp.int32)
@@ -252,9 +271,9 @@ def test_holes_take_the_nearest_neighbour_and_the_sky_stays():
 
 
 def test_gradients_of_everything_with_respect_to_the_pose_are_finite():
-    scan, image = np.stack([wall(ground=True), random_scan()]), np.stack([picture(), picture()])
+    scan, image = np.stack([wall(ground=True), random_scan()]), jnp.stack([picture(), picture()])
     calibration = np.stack([INTRINSICS] * 2), np.stack([CAMERA] * 2)
-    values = np.random.default_rng(0).random((2, *GRID.shape), np.float32)
+    values = jnp.asarray(np.random.default_rng(0).random((2, *GRID.shape), np.float32))
 
     def all_of(where):
         moved = reproject.onto_beams(reproject.move_range_view(scan, where, GEOMETRY), GEOMETRY)

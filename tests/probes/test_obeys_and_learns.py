@@ -1,14 +1,15 @@
 """Does training teach a model to obey actions: worlds in which nothing else decides what comes next.
 
 Measured with actions that reach prior and posterior alone: gain 0.91 of the bar with either latent, 0.93 of the wall
-with the 1D latent, 0.75 with the 2D latent.
+with the 1D latent, 0.75 with the 2D latent. (In the recurrence, with nothing known of the car's motion, the 2D latent
+has 0.82 of the wall after 150 steps.)
 """
 
 import probe_worlds
 import pytest
 
 WORLDS = {"bar": probe_worlds.Bar(), "wall": probe_worlds.Wall()}
-DEAF = pytest.mark.xfail(strict=True, reason="actions do not enter the recurrence yet")
+DEAF = pytest.mark.xfail(strict=True, reason="an action is one token among many")
 
 
 @pytest.mark.slow

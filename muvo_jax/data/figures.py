@@ -7,7 +7,7 @@ import collections
 import numpy as np
 
 from muvo_jax import config as config_lib
-from muvo_jax.data import judgements, schema
+from muvo_jax.data import fields, judgements, schema
 from muvo_jax.data.judgements import Finding
 from muvo_jax.ops import voxels
 
@@ -76,9 +76,11 @@ class Figures:
         """Looks for values that a label cannot have."""
         classes = len(self._described.classes)
         for name in ("image_classes", "point_classes"):
-            if name in frame and classes and frame[name].size and frame[name].max() >= classes:  # type: ignore[literal-required]
-                largest = int(frame[name].max())  # type: ignore[literal-required]
-                self._note(frame, name, f"class {largest}, but the recording names {classes} classes (0 to "
+            if name not in frame or not classes:
+                continue
+            known = frame[name][frame[name] != fields.UNKNOWN]  # type: ignore[literal-required]
+            if known.size and known.max() >= classes:
+                self._note(frame, name, f"class {int(known.max())}, but the recording names {classes} classes (0 to "
                                         f"{classes - 1})")
         if "occupancy" in frame and not np.isin(frame["occupancy"], _OCCUPANCY_VALUES).all():
             values = sorted(set(np.unique(frame["occupancy"]).tolist()) - set(_OCCUPANCY_VALUES))

@@ -11,7 +11,7 @@ import recording_writers as writers
 import street_scene
 
 from muvo_jax import config as config_lib
-from muvo_jax.data import alignment, checkup, judgements, kitti, plain
+from muvo_jax.data import alignment, checkup, figures, judgements, kitti, plain
 from muvo_jax.ops import camera as camera_ops
 
 CONTRACT = config_lib.ActionContract()
@@ -209,6 +209,17 @@ def test_points_in_centimetres_are_found(tmp_path):
         np.savez(path, points_m=np.random.default_rng(0).uniform(-4000, 4000, (100, 3)).astype(np.float32))
     texts = [finding.text for finding in checkup.examine(plain.PlainRecording(root)).findings]
     assert any("are they in metres?" in text for text in texts)
+
+
+def test_pixels_and_points_of_unknown_class_are_no_problem(tmp_path):
+    described = dataclasses.replace(plain.PlainRecording(writers.write_plain(tmp_path / "rec")).description,
+                                    classes=("sky", "road"))
+    for classes, said in (([0, 1, 255], False), ([0, 2, 255], True)):
+        counted = figures.Figures(described)
+        counted.add({"frame_id": 7, "image_classes": np.array([classes], np.uint8),
+                     "point_classes": np.array(classes, np.uint8)})
+        texts = [finding.text for finding in counted.findings() if "recording names 2 classes" in finding.text]
+        assert len(texts) == 2 * said and all("class 2, but" in text for text in texts)
 
 
 def test_nothing_to_look_at_is_a_problem(tmp_path):

@@ -54,5 +54,5 @@ def test_policies_of_one_config_compile_once_whatever_their_weights():
         moved = actor_critic.policy(config, jax.tree.map(lambda leaf, shift=shift: leaf + shift, actor))
         _, transitions = environment_lib.play(environment, params, jax.random.key(1), state, moved, 2)
         rewards.append(transitions.reward)
-        compiled.append(environment_lib.play._cache_size())
+        compiled.append(environment_lib._play._cache_size())
     assert compiled[0] == compiled[1] and not np.allclose(*rewards)

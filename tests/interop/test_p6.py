@@ -53,4 +53,4 @@ def test_recordings_of_another_drive_fail(tmp_path):
     run = "trainval/val0/Town03/0000"
     shutil.copytree(samples.MUVO_LAYOUT / run, tmp_path / run)
     report = runner.run_folder(samples.GOLDEN, registry.FILES, only=["p6"], recordings=tmp_path, write=lambda _: None)
-    assert not report.ok and any("no run Town01/0000 in train" in line for line in report.unexplained)
+    assert not report.ok and any("no run Town01/0000 in train" in line for line in report.stopped)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import operator
 from typing import Any
 
 import flax.struct
@@ -87,7 +88,7 @@ class TrainingMean:
             sums["known"] = {scale: count(value != types.OCCUPANCY_UNKNOWN) for scale, value in coarse.items()}
         before = {name: getattr(self, name) for name in sums}
         return dataclasses.replace(self, **{
-            name: value if before[name] is None else jax.tree.map(np.add, before[name], value)
+            name: value if before[name] is None else jax.tree.map(operator.add, before[name], value)
             for name, value in sums.items()})
 
     def prediction(self) -> Frames:

@@ -26,7 +26,12 @@ TINY = dataclasses.replace(presets.get("tiny").model, numerics="reference", tran
 def drawn_variables(config):
     shapes = world_model.WorldModel(config).variable_shapes()
     random = np.random.default_rng(0)
-    return jax.tree.map(lambda leaf: random.normal(size=leaf.shape).astype(np.float32), shapes)
+
+    def draw(path, leaf):
+        value = (0.1 * random.normal(size=leaf.shape)).astype(np.float32)
+        return 0.5 + np.abs(value) if path[-1].key == "var" else value  # a network that can be run
+
+    return jax.tree_util.tree_map_with_path(draw, shapes)
 
 
 def checkpoint_of(state_dict):

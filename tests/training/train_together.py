@@ -3,6 +3,7 @@
     python train_together.py RECORDING OUT.json PROCESS PROCESSES PORT
 """
 
+import dataclasses
 import json
 import os
 import pathlib
@@ -35,8 +36,10 @@ def train(recording_path: str) -> dict:
     from muvo_jax.training import step as step_lib
 
     recording = plain.PlainRecording(recording_path)
-    config = prepare.adapt(small_world.make_config(ACCUMULATE, heads=("image", "action")), recording,
-                           keep=("data.frames",)).config
+    config = small_world.make_config(ACCUMULATE, heads=("image", "action"))
+    # Nobody labelled instances in this recording.
+    config = dataclasses.replace(config, loss=dataclasses.replace(config.loss, image_instance=0.0))
+    config = prepare.adapt(config, recording, keep=("data.frames",)).config
     source = pipeline.TrainBatches(pipeline.Frames(recording, config), seed=0, batch=loop.windows_per_step(config),
                                    process=jax.process_index(), processes=jax.process_count(), accumulate=ACCUMULATE)
     model = small_world.SmallWorld(config.model)

@@ -7,24 +7,14 @@ import math
 from typing import Annotated, Any, Literal
 
 from muvo_jax.config_augmentation import AugmentationConfig
-from muvo_jax.config_heads import (
-    ALL_HEADS,
-    BIRDS_EYE_CLASSES,
-    EGO_MOTION_UNITS,
-    HEADS,
-    TARGETS,
-    TERM_TARGETS,
-    LossConfig,
-    head_targets,
-)
+from muvo_jax.config_heads import BIRDS_EYE_CLASSES, HEADS, KNOWN_HEADS, LossConfig
 from muvo_jax.config_json import check_choice, override, override_all, parse
 from muvo_jax.geometry import BirdsEyeGrid, PillarGrid, RangeViewGeometry, RouteMap, VoxelGrid
 from muvo_jax.limits import COUNT, NOT_NEGATIVE, SHARE, Limits, above, at_least, between, check
 
-__all__ = ["ALL_HEADS", "BIRDS_EYE_CLASSES", "EGO_MOTION_UNITS", "HEADS", "TARGETS", "TERM_TARGETS", "ActionContract",
-           "AugmentationConfig", "BirdsEyeGrid", "Config", "DataConfig", "EvaluationConfig", "LossConfig",
-           "ModelConfig", "OptimizerConfig", "PillarGrid", "RangeViewGeometry", "RouteMap", "TrainConfig", "VoxelGrid",
-           "head_targets", "override", "override_all", "parse"]
+__all__ = ["BIRDS_EYE_CLASSES", "HEADS", "KNOWN_HEADS", "ActionContract", "AugmentationConfig", "BirdsEyeGrid",
+           "Config", "DataConfig", "EvaluationConfig", "LossConfig", "ModelConfig", "OptimizerConfig", "PillarGrid",
+           "RangeViewGeometry", "RouteMap", "TrainConfig", "VoxelGrid", "override", "override_all", "parse"]
 
 FUSIONS = ("tr", "fc", "avg")
 LIDAR_ENCODERS = ("rv", "pp")
@@ -84,7 +74,7 @@ class ModelConfig:
       fusion, lidar, camera, latent: the variant, see `variant`. Either lidar or camera may be "none": then the model
         does not see that sensor (its heads are another matter).
       numerics: "standard" follows the mathematics, "reference" the authors' code (DEVIATIONS.md lists the difference).
-      heads: what is decoded, of config_heads.TARGETS; a modality that the data lacks has no head.
+      heads: what is decoded, of KNOWN_HEADS; a modality that the data lacks has no head.
       semantic_classes: of the heads semantic_image and semantic_range_view, as the recording counts them.
       route, speed: whether the planned route and the speed are inputs.
       route_encoder: a ResNet-18 as in the paper, which is larger than a small preset's whole transition, or "small".
@@ -194,7 +184,7 @@ class ModelConfig:
                             ("camera", (*CAMERA_ENCODERS, NO_SENSOR)), ("backbone", BACKBONES)):
             check_choice(f"model.{name}", getattr(self, name), known)
         for head in self.heads:
-            check_choice("model.heads", head, ALL_HEADS)
+            check_choice("model.heads", head, tuple(KNOWN_HEADS))
         if any(side % 32 for side in self.image_size):
             raise ValueError(f"model.image_size {self.image_size}: rows and columns must be multiples of 32.")
         if self.range_view.rows % 32 or self.range_view.columns % 32:
@@ -386,12 +376,6 @@ class Config:
                              f"choose model.first_guess=training_mean.")
         if self.model.kinematics != wanted:  # one truth: contract and stride
             object.__setattr__(self, "model", dataclasses.replace(self.model, kinematics=wanted))
-
-    @property
-    def targets(self) -> dict[str, tuple[int, ...]]:
-        """What the loss terms of the heads compare with: Batch field -> its shape for one frame."""
-        return {field: shape for head in self.model.heads
-                for field, shape in head_targets(head, self.model, self.loss).items()}
 
     def to_dict(self) -> dict[str, Any]:
         """Plain JSON types."""

@@ -11,7 +11,7 @@ import muvo_jax
 
 PACKAGE = pathlib.Path(muvo_jax.__file__).parent
 BASE = {"types", "config", "config_augmentation", "config_heads", "config_json", "geometry", "limits",
-        "ops"}
+        "ops", "head"}
 ALLOWED = {
     "types": set(),
     "limits": set(),
@@ -23,10 +23,12 @@ ALLOWED = {
     "config": {"config_augmentation", "config_heads", "config_json", "geometry", "limits"},
     "presets": {"config"},
     "ops": {"types", "config", "geometry"},
+    "head": {"types", "config"},
     "nn": BASE,
     "model": BASE | {"nn"},
     "objectives": BASE | {"nn", "model"},
     "metrics": BASE | {"nn", "model"},
+    "heads": BASE | {"nn", "model", "objectives", "metrics", "viz"},  # imported by none: found by name
     "run": {"types", "config", "model"},
     "agents": BASE | {"nn", "model", "metrics", "run"},
     "data": BASE,

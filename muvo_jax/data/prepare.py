@@ -15,6 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 from muvo_jax import config as config_lib
+from muvo_jax import head as head_lib
 from muvo_jax.data import schema
 from muvo_jax.ops import camera as camera_ops
 from muvo_jax.ops import range_view as range_view_ops
@@ -87,20 +88,20 @@ def prepare_frame(raw: schema.RawFrame, config: config_lib.Config) -> PreparedFr
     Raises:
       DataError: where the frame does not fit the config, naming frame and field.
     """
-    model = config.model
+    model, targets = config.model, head_lib.targets(config)
     lacking = sorted(needed(config, raw.keys()) - raw.keys())
     if lacking:
         raise schema.DataError(f"frame {int(raw['frame_id'])} has no {', '.join(lacking)}, which the model needs. "
                                f"Choose windows of sequences that have it (schema.Sequence.has).")
     ready: PreparedFrame = {name: raw[name] for name in ("action", "timestamp_s", "frame_id")}
     try:
-        if model.camera != config_lib.NO_SENSOR or "image" in config.targets:
+        if model.camera != config_lib.NO_SENSOR or "image" in targets:
             ready["image"], ready["intrinsics"] = camera_ops.resize_crop(raw["image"], raw["intrinsics"],
                                                                          model.image_size)
             ready["camera_to_ego"] = raw["camera_to_ego"]
-        if model.lidar != config_lib.NO_SENSOR or "range_view" in config.targets:
+        if model.lidar != config_lib.NO_SENSOR or "range_view" in targets:
             ready["range_view"] = range_view_ops.project(raw["points_m"], model.range_view)
-        if "occupancy" in model.heads:
+        if "occupancy" in targets:
             ready["occupancy"] = _occupancy(raw, model)
     except ValueError as error:
         raise schema.DataError(f"frame {int(raw['frame_id'])}: {error}") from error
@@ -113,7 +114,7 @@ def prepare_frame(raw: schema.RawFrame, config: config_lib.Config) -> PreparedFr
         ready["route_map"] = raw["route_map"]
     if "speed_mps" in raw:
         ready["speed_mps"] = raw["speed_mps"]
-    for name in ("reward", "is_terminal", *(config.targets.keys() - _ALWAYS_THERE - _MADE_OF.keys())):
+    for name in ("reward", "is_terminal", *(targets.keys() - _ALWAYS_THERE - _MADE_OF.keys())):
         if name in raw:
             ready[name] = raw[name]  # type: ignore[literal-required]
     if "pose" in raw and "speed_mps" in raw:  # still in the frame of the run: motion begins with a second frame
@@ -123,7 +124,7 @@ def prepare_frame(raw: schema.RawFrame, config: config_lib.Config) -> PreparedFr
 
 def judged_only(config: config_lib.Config) -> frozenset[str]:
     """The fields of a prepared frame that scores read and training does not, as far as a recording has them."""
-    return _JUDGED - config.targets.keys()
+    return _JUDGED - head_lib.targets(config).keys()
 
 
 def _moving(raw: schema.RawFrame, ready: PreparedFrame, config: config_lib.Config) -> PreparedFrame:
@@ -139,7 +140,7 @@ def _moving(raw: schema.RawFrame, ready: PreparedFrame, config: config_lib.Confi
 def _labels(raw: schema.RawFrame, config: config_lib.Config) -> PreparedFrame:
     """Targets that must be brought to the model's sizes, as far as the frame has them."""
     ready: PreparedFrame = {}
-    model, targets = config.model, config.targets
+    model, targets = config.model, head_lib.targets(config)
     if "depth_m" in raw and "depth_m" in targets:
         depth_m = camera_ops.resize_crop_nearest(raw["depth_m"], model.image_size)
         ready["depth_m"] = np.where(depth_m < DEPTH_LIMIT_M, depth_m, range_view_ops.NO_RETURN_M).astype(np.float32)
@@ -155,13 +156,13 @@ def _labels(raw: schema.RawFrame, config: config_lib.Config) -> PreparedFrame:
 
 def needed(config: config_lib.Config, modalities: Collection[str]) -> frozenset[str]:
     """The keys of RawFrame that `prepare_frame` must find, of a recording with these modalities."""
-    model, targets = config.model, config.targets
+    model, targets = config.model, head_lib.targets(config)
     names = {"action", "timestamp_s", "frame_id"} | (_recorded(targets) - _OPTIONAL)
     if model.camera != config_lib.NO_SENSOR or "image" in targets:
         names |= {"image", "intrinsics", "camera_to_ego"}
     if model.lidar != config_lib.NO_SENSOR or "range_view" in targets:
         names.add("points_m")
-    if "occupancy" in model.heads:
+    if "occupancy" in targets:
         names.add("occupancy" if "occupancy" in modalities else "points_m")
     names |= set(NAVIGATION) if model.navigation else set()
     speed = model.speed or (model.tracks_motion and model.kinematics is not None)
@@ -171,7 +172,7 @@ def needed(config: config_lib.Config, modalities: Collection[str]) -> frozenset[
 
 def labels(config: config_lib.Config) -> frozenset[str]:
     """Which of schema.LABELS the heads of a model learn from."""
-    return schema.LABELS & _recorded(config.targets)
+    return schema.LABELS & _recorded(head_lib.targets(config))
 
 
 def _recorded(targets: Collection[str]) -> frozenset[str]:
@@ -182,10 +183,11 @@ def _recorded(targets: Collection[str]) -> frozenset[str]:
 def check_targets(config: config_lib.Config, description: schema.RecordingDescription) -> None:
     """Raises DataError where a head or term cannot be trained: names it, what the recording lacks, and the way out."""
     for head in config.model.heads:
-        fields = config_lib.head_targets(head, config.model, config.loss)
+        described = head_lib.get(head)
+        fields = described.learns_from(config.model, config.loss)
         for field in sorted(_recorded(fields) - description.modalities):
-            if field in config_lib.TERM_TARGETS:
-                weight = config_lib.TERM_TARGETS[field].weight
+            if field in described.term_targets:
+                weight = described.term_targets[field].weight
                 raise schema.DataError(f"loss.{weight} is on and learns from {field}, which recording "
                                        f"{description.name!r} does not hold. Leave the term out (--set "
                                        f"loss.{weight}=0), or record what it takes (docs/variants.md).")

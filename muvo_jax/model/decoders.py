@@ -1,6 +1,8 @@
-"""Decoders from the latent features to images, range views, voxels and actions (paper section III-D).
+"""Decoders from the latent features to images, range views, voxels and numbers (paper section III-D).
 
-Each maps features [N, F] to {scale: array}, scale 1 being the full size, 2 and 4 halved once and twice.
+Each maps features [N, F], or with the 2D latent a map of tokens [N, *grid, C], to {scale: array}, scale 1 being the
+full size, 2 and 4 halved once and twice. Those of tokens are a convolution, doublings at full width, then three with
+half, a quarter and an eighth of it, each of which ends in one scale. What heads are built of stands at the end.
 """
 
 from __future__ import annotations
@@ -9,11 +11,14 @@ import jax
 import jax.numpy as jnp
 from flax import linen
 
+from muvo_jax.config import ModelConfig
+from muvo_jax.model import common, tokens
 from muvo_jax.nn import layers, norm
 from muvo_jax.ops import resample
 
 _PLANE_KERNELS = (5, 5, 6, 6, 6, 6)
 INSTANCE_CHANNELS = 3  # offset and centre
+_TOKEN_STAGES = ((4, 2), (2, 4), (1, 8))  # scale, by what the width is divided
 
 
 def plane_start(size: tuple[int, ...]) -> tuple[tuple[int, ...], tuple[int, ...]]:
@@ -123,7 +128,11 @@ class StyledDecoder(linen.Module):
 
     @linen.compact
     def __call__(self, features: jax.Array) -> dict[int, jax.Array]:
-        start = tuple(side // 2 ** (self.blocks + 3) for side in self.shape)
+        shrink = 2 ** (self.blocks + 3)
+        if any(side % shrink for side in self.shape):
+            raise ValueError(f"a decoder of {self.shape} voxels doubles {self.blocks + 3} times: each side must be a "
+                             f"multiple of {shrink}. Change model.voxels or model.occupancy_blocks.")
+        start = tuple(side // shrink for side in self.shape)
         constant = self.param("constant", layers.shape_only, (*start, self.constant_width)).astype(self.compute.dtype)
         x = jnp.broadcast_to(constant[None], (features.shape[0], *constant.shape))
         x = norm.AdaptiveInstanceNorm(self.compute, name="first_norm")(x, features)
@@ -133,6 +142,55 @@ class StyledDecoder(linen.Module):
         out = {}
         for scale, width in ((4, self.width // 2), (2, self.width // 4), (1, self.width // 8)):
             x = StyledUpBlock(width, self.compute, name=f"up_{scale}")(x, features)
+            out[scale] = self.head(self.channels, self.compute, name=f"head_{scale}")(x).astype(jnp.float32)
+        return out
+
+
+class _Doubling(linen.Module):
+    """Transposed convolution of stride 2, ELU: every side doubles."""
+
+    features: int
+    kernel: int
+    compute: layers.Compute = layers.Compute()
+
+    @linen.compact
+    def __call__(self, x: jax.Array) -> jax.Array:
+        rank = x.ndim - 2
+        conv = layers.ConvTranspose(self.features, (self.kernel,) * rank, (2,) * rank, self.compute, name="conv")
+        return jax.nn.elu(conv(x))
+
+
+class TokenDecoder(linen.Module):
+    """[N, *grid, C] -> [N, *(grid * 2**(stages + 3) / scale), channels], for two or three axes; no output activation.
+
+    Attributes:
+      channels: of every output.
+      first_width: of the first convolution.
+      width: of the `stages` doublings, and what the last three divide.
+      stages: doublings before the first output.
+      head: the layer that ends each scale.
+      flat: decode the ground plan, the largest value over the last of three axes.
+    """
+
+    channels: int
+    first_width: int
+    width: int
+    stages: int
+    compute: layers.Compute = layers.Compute()
+    head: type[layers.Dense] | type[BirdsEyeHead] = layers.Dense
+    flat: bool = False
+
+    @linen.compact
+    def __call__(self, cells: jax.Array) -> dict[int, jax.Array]:
+        if self.flat:
+            cells = cells.max(axis=-2)
+        rank = cells.ndim - 2
+        x = jax.nn.elu(layers.Conv(self.first_width, (3,) * rank, self.compute, name="first")(cells))
+        for index in range(self.stages):
+            x = _Doubling(self.width, 4, self.compute, name=f"pre{index}")(x)
+        out = {}
+        for scale, divisor in _TOKEN_STAGES:
+            x = _Doubling(self.width // divisor, 6, self.compute, name=f"grow_{scale}")(x)
             out[scale] = self.head(self.channels, self.compute, name=f"head_{scale}")(x).astype(jnp.float32)
         return out
 
@@ -160,3 +218,43 @@ class VectorDecoder(linen.Module):
     def __call__(self, features: jax.Array) -> dict[int, jax.Array]:
         out = layers.Mlp((self.width, self.width, self.channels), self.compute, name="mlp")(features)
         return {1: out.astype(jnp.float32)}
+
+
+def of_image(config: ModelConfig, channels: int) -> linen.Module:
+    """What draws on the image's plane."""
+    return _plane(config, channels, config.image_size, tokens.IMAGE_SHRINK)
+
+
+def of_range_view(config: ModelConfig, channels: int) -> linen.Module:
+    """What draws on the range view's plane."""
+    return _plane(config, channels, (config.range_view.rows, config.range_view.columns), tokens.RANGE_VIEW_SHRINK)
+
+
+def of_voxels(config: ModelConfig, channels: int) -> linen.Module:
+    """What fills the voxel grid."""
+    width, compute = config.occupancy_channels, common.compute(config)
+    if config.latent == "2d":
+        return TokenDecoder(channels, 2 * width, width, config.occupancy_token_stages, compute)
+    return StyledDecoder(config.voxels.shape, channels, 2 * width, width, config.occupancy_blocks, compute=compute)
+
+
+def of_ground_plan(config: ModelConfig, classes: int) -> linen.Module:
+    """What draws classes and instances on the ground plan of the voxel grid."""
+    width, compute, channels = config.decoder_channels, common.compute(config), classes + INSTANCE_CHANNELS
+    if config.latent == "2d":
+        return TokenDecoder(channels, width, width, config.occupancy_token_stages, compute, BirdsEyeHead, flat=True)
+    return StyledDecoder(config.voxels.shape[:2], channels, width, width, config.occupancy_blocks, BirdsEyeHead,
+                         compute)
+
+
+def of_numbers(config: ModelConfig, channels: int) -> linen.Module:
+    """A few numbers, without an output activation: reward, motion and the like."""
+    return VectorDecoder(channels, config.decoder_channels, common.compute(config))
+
+
+def _plane(config: ModelConfig, channels: int, size: tuple[int, int], token_shrink: int) -> linen.Module:
+    width, compute = config.decoder_channels, common.compute(config)
+    if config.latent == "2d":
+        stages = token_shrink.bit_length() - 4  # three more doublings end in an output each
+        return TokenDecoder(channels, width, width, stages, compute)
+    return PlaneDecoder(size, channels, width, compute)

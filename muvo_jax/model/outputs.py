@@ -14,10 +14,10 @@ import jax.numpy as jnp
 import numpy as np
 from flax import linen
 
+from muvo_jax import head as head_lib
 from muvo_jax.config import ModelConfig
+from muvo_jax.model import memory
 from muvo_jax.ops import range_view as range_view_ops
-
-FIRST_GUESS_HEADS = ("image", "range_view", "occupancy")
 
 
 class FirstGuess(linen.Module):
@@ -42,3 +42,25 @@ def along_beams(raw: jax.Array, scale: int, config: ModelConfig) -> jax.Array:
     ranges = raw[..., 3:]
     points = raw[..., :3] + jnp.asarray(beams)[None] * ranges + jnp.asarray(position).reshape(1, 1, 1, 3)
     return jnp.concatenate([points, ranges], axis=-1)
+
+
+def initial_constants(config: ModelConfig) -> dict[str, float]:
+    """Path of a parameter -> its first value, for the heads that this model has.
+
+    Where the average training frame is the first guess, the last layers start at zero and add nothing to it.
+    """
+    values: dict[str, float] = {}
+    guessed = memory.guessed_heads(config)
+    for name in config.heads:
+        head = head_lib.get(name)
+        if head.initial_bias is None:
+            continue
+        for scale in head.scales:
+            path = f"decoders_{name}/{'decoder/' if name in guessed else ''}head_{scale}"
+            if name in guessed and name == "image" and scale == 1:
+                values[f"decoders_{name}/decoder/blur/kernel"] = 0.0
+            if config.first_guess != "zero" and head.average is not None:
+                values |= {f"{path}/bias": 0.0, f"{path}/kernel": 0.0}
+            else:
+                values[f"{path}/bias"] = head.initial_bias
+    return values

@@ -21,12 +21,12 @@ import jax
 import jax.numpy as jnp
 from flax import linen
 
-from muvo_jax.config import NO_SENSOR, ModelConfig
+from muvo_jax import head as head_lib
+from muvo_jax.config import KNOWN_HEADS, NO_SENSOR, ModelConfig
 from muvo_jax.model import (
     camera,
     fusion,
     guided,
-    heads,
     lidar,
     measurements,
     outputs,
@@ -35,7 +35,7 @@ from muvo_jax.model import (
 )
 from muvo_jax.model import memory as memory_lib
 from muvo_jax.nn import init as init_lib
-from muvo_jax.nn import layers, norm
+from muvo_jax.nn import norm
 from muvo_jax.types import (
     BATCH_FIELDS,
     UNTIMED_FIELDS,
@@ -75,12 +75,12 @@ class Network(linen.Module):
         self.fusion = fusion.REGISTRY[config.fusion](config)
         self.transition = transition.REGISTRY[config.latent](config)
         guessed = memory_lib.guessed_heads(config)
-        self.decoders = {name: guided.GuidedHead(config, name) if name in guessed
-                         else head.build(config, head.channels_of(config)) for name, head in heads.TABLE.items()
-                         if name in config.heads}
+        described = {name: head_lib.get(name) for name in KNOWN_HEADS if name in config.heads}
+        self.decoders = {name: guided.GuidedHead(config, name) if name in guessed else head.build(config)
+                         for name, head in described.items()}
         if config.first_guess != "zero":
-            self.first_guess = {name: outputs.FirstGuess() for name in outputs.FIRST_GUESS_HEADS
-                                if name in config.heads}
+            self.first_guess = {name: outputs.FirstGuess() for name, head in described.items()
+                                if head.average is not None}
 
     def encode(self, frames: dict[str, jax.Array], mode: norm.Mode, keys: jax.Array | None) -> jax.Array:
         measured = []
@@ -109,7 +109,7 @@ class Network(linen.Module):
     def ego_motion(self, features: jax.Array) -> Motion:
         """The step that led to states, as the head says."""
         value = self.decoders["ego_motion"](self.read(features, "ego_motion"))[1]
-        value = value * layers.per_channel(jnp.asarray(heads.TABLE["ego_motion"].unit(self.config)), value.ndim)
+        value = head_lib.get("ego_motion").finish(value, 1, self.config)
         return Motion(value[..., :3], value[..., 3])
 
     def decode(self, features: jax.Array, vantage: Vantage | None, memory: Memory | None, rows: jax.Array | None,
@@ -134,7 +134,7 @@ class Network(linen.Module):
         """What a head decodes of the features: with the 2D latent its group of tokens, or all of them pooled."""
         if self.config.latent == "1d":
             return features
-        group = heads.TABLE[head].tokens
+        group = head_lib.get(head).tokens
         return tokens.pool(features, self.config) if group is None else tokens.read(features, group, self.config)
 
     def everything(self, frames: dict[str, jax.Array], noise: StepNoise, action: jax.Array, state: LatentState,
@@ -197,7 +197,7 @@ class WorldModel:
         """
         if batch is not None:
             self._frames(batch)
-        constants = {**heads.initial_constants(self.config), **transition.initial_constants(self.config),
+        constants = {**outputs.initial_constants(self.config), **transition.initial_constants(self.config),
                      **fusion.initial_constants(self.config)}
         return init_lib.fill(self.variable_shapes(), key, constants)
 
@@ -284,7 +284,7 @@ class WorldModel:
         Returns:
           Predictions, float32 [..., *size / scale, channels]: image in [0, 1] where trained (no clipping), range_view
           in metres, occupancy as logits [..., X, Y, Z, 2], action in (-1, 1) [..., 2], at full size only; what other
-          heads return, model/heads.py says.
+          heads return, their files in muvo_jax/heads say.
 
         Raises:
           ValueError: for a head that the model does not have, features of another shape, or states without the memory
@@ -307,7 +307,8 @@ class WorldModel:
         else:
             vantage, rows = memory_lib.check(self.config, states, memory, rows, lead)
         flat = self._apply(variables, "decode", features.reshape(-1, *shape), vantage, memory, rows, names)
-        return Predictions({name: {scale: _finished(value, name, scale, self.config).reshape(*lead, *value.shape[1:])
+        finish = lambda name, scale, value: head_lib.get(name).finish(value, scale, self.config)
+        return Predictions({name: {scale: finish(name, scale, value).reshape(*lead, *value.shape[1:])
                                    for scale, value in scales.items()} for name, scales in flat.items()})
 
     def _apply(self, variables: Variables, method: str, *args, **options) -> Any:
@@ -346,15 +347,6 @@ def inputs(config: ModelConfig) -> dict[str, tuple[int, ...]]:
     if config.speed or (config.tracks_motion and config.kinematics is not None):
         fields["speed_mps"] = ()
     return fields | memory_lib.inputs(config)
-
-
-def _finished(value: jax.Array, name: str, scale: int, config: ModelConfig) -> jax.Array:
-    if name == "range_view" and config.range_view_points == "beams":
-        value = outputs.along_beams(value, scale, config)
-    unit = heads.TABLE[name].unit(config)
-    if isinstance(unit, tuple):
-        return value * layers.per_channel(jnp.asarray(unit, jnp.float32), value.ndim)
-    return value if unit == 1.0 else value * unit
 
 
 @functools.lru_cache(maxsize=8)

@@ -22,6 +22,7 @@ from muvo_jax.ops import reproject, scene_flow
 from muvo_jax.types import RANGE_NO_RETURN_M, Array, Memory, Vantage
 
 FADE = 0.8  # weight of evidence that is one observation older: what moved away is forgotten
+EDGE = 0.5  # half of what came into view is guessed from the edge of what was seen, half from the average frame
 FORESEEN_STEPS = 12  # for so many steps `with_evidence` works out where what moves goes; it is gone afterwards
 _MOVING_M = (0.5, 2.5)  # heights over the road between which road users are looked for
 
@@ -31,11 +32,15 @@ class ImageGlimpse:
     """The memory of the head image from n vantages, at full size.
 
     Attributes:
-      image: float32 [n, H, W, 3] in [0, 1], the newest image moved, and `covered` [n, H, W, 1], 1 where it was seen.
+      covered: float32 [n, H, W, 1], how far the newest image, moved, is to be believed: 1 where it was seen, EDGE where
+        it is continued from its edge, 0 without an image.
+      image: float32 [n, H, W, 3] in [0, 1], that image times `covered`.
+      colour: float32 [n, 1, 1, 3], its mean as it was; 0 without an image.
     """
 
     image: Array
     covered: Array
+    colour: Array
 
 
 @flax.struct.dataclass
@@ -169,8 +174,10 @@ def _image(config: ModelConfig, memory: Memory, sight: Sight, view: RangeGlimpse
     moved, inside = reproject.move_image(images, view.filled_m, sight.pose[:, -1], memory.intrinsics[rows],
                                          memory.camera_to_ego[rows], config.range_view,
                                          rows * memory.image.shape[1] + sight.index[:, -1])
-    covered = jnp.expand_dims((inside & sight.known[:, -1].reshape(-1, 1, 1)).astype(jnp.float32), -1)
-    return ImageGlimpse(image=moved / 255.0 * covered, covered=covered)
+    known = sight.known[:, -1].astype(jnp.float32).reshape(-1, 1, 1, 1)
+    covered = jnp.where(jnp.expand_dims(inside, -1), 1.0, EDGE) * known
+    colour = memory.image.astype(jnp.float32).mean(axis=(2, 3))[rows, sight.index[:, -1]].reshape(-1, 1, 1, 3)
+    return ImageGlimpse(image=moved / 255.0 * covered, covered=covered, colour=colour / 255.0 * known)
 
 
 def _voxels(config: ModelConfig, memory: Memory, sight: Sight) -> VoxelGlimpse:

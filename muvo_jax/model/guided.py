@@ -107,13 +107,16 @@ def _see_image(glimpse: glimpse_lib.ImageGlimpse, config: ModelConfig) -> jax.Ar
 
 
 def _compose_image(raw, glimpse: glimpse_lib.ImageGlimpse, mean, config: ModelConfig) -> dict[int, jax.Array]:
+    """The average frame is put in the light of the newest image: at night it would fill every turn with daylight."""
     del config
     drawn, average = raw, mean(jax.tree.map(jnp.zeros_like, raw))
+    usual = average[1].mean(axis=(1, 2), keepdims=True)
+    light = jnp.where((glimpse.colour > 0.0) & (usual > 0.0), glimpse.colour / jnp.where(usual > 0.0, usual, 1.0), 1.0)
     moved, covered, result = glimpse.image, glimpse.covered, {}
-    for scale in (1, 2, 4):
+    for scale in SCALES:
         if scale > 1:
             moved, covered = resample.mean_pool2(moved), resample.mean_pool2(covered)
-        result[scale] = moved + (1.0 - covered) * average[scale] + drawn[scale]
+        result[scale] = moved + (1.0 - covered) * light * average[scale] + drawn[scale]
     return result
 
 
@@ -171,7 +174,7 @@ def _compose_voxels(raw, glimpse: glimpse_lib.VoxelGlimpse, mean, config: ModelC
     believed = trust * evidence
     raw = {scale: value.reshape(*value.shape[:3], -1, 2) for scale, value in raw.items()}
     own, result = mean(raw), {}
-    for scale in (1, 2, 4):
+    for scale in SCALES:
         if scale > 1:
             believed = resample.max_pool2(believed)
         result[scale] = own[scale] + jnp.stack([jnp.zeros_like(believed), believed], axis=-1)

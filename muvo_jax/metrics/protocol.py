@@ -50,7 +50,8 @@ def identity(config: config_lib.Config) -> str:
     latents = "sampled" if evaluation.sampled else "mean"
     return (f"{VERSION}: context {data.context}, horizon {data.horizon}, {frame_s:g} s a step, Chamfer on "
             f"{evaluation.chamfer_points or 'all'} points, return above {evaluation.return_threshold_m:g} m, "
-            f"occupied above {config.model.occupied_above:g}, {latents} latents, {_MOTION[config.contract.kinematics]}, seed {evaluation.seed}")
+            f"occupied above {config.model.occupied_above:g}, {latents} latents, "
+            f"{_MOTION[config.contract.kinematics]}, seed {evaluation.seed}")
 
 
 def predict(model: world_model.WorldModel, variables: types.Variables, key: types.Array, batch: types.Batch, *,

@@ -30,9 +30,11 @@ ALLOWED = {
     "run": {"types", "config", "model"},
     "agents": BASE | {"nn", "model", "metrics", "run"},
     "data": BASE,
+    "town": BASE | {"data"},
+    "recordings": {"config", "data", "town"},
     "viz": BASE,
     "interop": BASE | {"nn", "model", "objectives", "metrics", "data", "training", "command_line", "late"},
-    "training": BASE | {"nn", "model", "run", "objectives", "metrics", "data"},
+    "training": BASE | {"nn", "model", "run", "objectives", "metrics", "data", "recordings"},
 }
 
 

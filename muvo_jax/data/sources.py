@@ -6,9 +6,7 @@ import pathlib
 from collections.abc import Callable, Collection
 from typing import Any, NamedTuple
 
-from muvo_jax import config as config_lib
-from muvo_jax.data import carla, carla_runs, files, kitti, manifest, plain, prepare, records, schema
-from muvo_jax.data.town import record
+from muvo_jax.data import carla, carla_runs, files, kitti, manifest, plain, records, schema
 
 
 class Kind(NamedTuple):
@@ -97,18 +95,3 @@ def open_recording(path: pathlib.Path | str, *, camera: str = "", skip_corrupt_s
     given: dict[str, Any] = {"labels": frozenset(labels), "corrupt": "skip" if skip_corrupt_shards else "raise"}
     given |= {"camera": camera} if camera else {}
     return kind.open(path, **{name: value for name, value in given.items() if name in kind.options})
-
-
-def open_configured(config: config_lib.Config, progress: record.Progress | None = None) -> schema.Recording:
-    """Opens the recording that a config names; the built-in town is recorded first where it is not in the cache.
-
-    Args:
-      progress: called with (frames done, frames in all) while the town is recorded.
-
-    Raises:
-      DataError: as open_recording.
-    """
-    if config.data.path == "town":
-        return open_recording(record.cached_town(config, progress), labels=prepare.labels(config))
-    return open_recording(config.data.path, camera=config.data.camera, labels=prepare.labels(config),
-                          skip_corrupt_shards=config.data.skip_corrupt_shards)

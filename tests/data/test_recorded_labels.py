@@ -8,9 +8,9 @@ import recording_samples as samples
 
 from muvo_jax import presets
 from muvo_jax.data import carla, pipeline, plain, prepare, schema
-from muvo_jax.data.town import boxes, record, settings
-from muvo_jax.data.town.simulator import Town
 from muvo_jax.ops import camera, range_view
+from muvo_jax.town import boxes, record, settings
+from muvo_jax.town.simulator import Town
 
 HEADS = ("image", "depth", "semantic_image", "semantic_range_view", "birds_eye")
 CONFIG = dataclasses.replace(presets.tiny(), model=dataclasses.replace(presets.tiny().model, heads=HEADS),

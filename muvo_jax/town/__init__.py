@@ -3,16 +3,16 @@
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from muvo_jax.data.town.settings import TownConfig
-    from muvo_jax.data.town.simulator import Town, TownState
+    from muvo_jax.town.settings import TownConfig
+    from muvo_jax.town.simulator import Town, TownState
 
 __all__ = ["Town", "TownConfig", "TownState"]
 
 
 def __getattr__(name):
-    """The simulator brings JAX, which readers that know the town's classes do without."""
+    """The simulator brings JAX, which waits until it is used."""
     if name in __all__:
-        from muvo_jax.data.town import settings, simulator
+        from muvo_jax.town import settings, simulator
 
         return getattr(settings if name == "TownConfig" else simulator, name)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

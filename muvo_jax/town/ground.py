@@ -10,8 +10,8 @@ import dataclasses
 
 import numpy as np
 
-from muvo_jax.data.town import boxes as box_lib
-from muvo_jax.data.town import map as map_lib
+from muvo_jax.town import boxes as box_lib
+from muvo_jax.town import map as map_lib
 
 CELL_M = 0.2
 LEVELS = 6

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from muvo_jax.data.town import boxes as box_lib
-from muvo_jax.data.town import ground as ground_lib
-from muvo_jax.data.town import raycast, settings
-from muvo_jax.data.town.scenery import STOREY_M
+from muvo_jax.town import boxes as box_lib
+from muvo_jax.town import ground as ground_lib
+from muvo_jax.town import raycast, settings
+from muvo_jax.town.scenery import STOREY_M
 
 
 def shade(fan: raycast.Fan, hits: raycast.Hits, origin_m: np.ndarray, yaw_rad: float, boxes: box_lib.Boxes,

@@ -12,8 +12,8 @@ import dataclasses
 import flax.struct
 import numpy as np
 
-from muvo_jax.data.town import driver, settings
-from muvo_jax.data.town import map as map_lib
+from muvo_jax.town import driver, settings
+from muvo_jax.town import map as map_lib
 
 CAR_RADIUS_M = 1.9
 PERSON_RADIUS_M = 1.6

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from muvo_jax.data.town import boxes as box_lib
-from muvo_jax.data.town import map as map_lib
-from muvo_jax.data.town import settings
+from muvo_jax.town import boxes as box_lib
+from muvo_jax.town import map as map_lib
+from muvo_jax.town import settings
 
 _WALLS = np.array([[.78, .68, .55], [.72, .45, .36], [.85, .82, .75], [.62, .64, .67], [.80, .72, .48], [.55, .40, .33],
                    [.66, .74, .78], [.83, .62, .52]], np.float32)

@@ -10,9 +10,9 @@ from __future__ import annotations
 import numpy as np
 
 from muvo_jax import config as config_lib
-from muvo_jax.data.town import boxes as box_lib
-from muvo_jax.data.town import ground as ground_lib
-from muvo_jax.data.town import raycast
+from muvo_jax.town import boxes as box_lib
+from muvo_jax.town import ground as ground_lib
+from muvo_jax.town import raycast
 
 # Of config.BIRDS_EYE_CLASSES; the town has no traffic lights.
 _ROAD, _MARKING, _VEHICLE, _PEDESTRIAN = 1, 2, 3, 4

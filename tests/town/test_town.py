@@ -9,11 +9,11 @@ import pytest
 from muvo_jax import config as config_lib
 from muvo_jax import presets
 from muvo_jax.data import sources
-from muvo_jax.data.town import Town, TownConfig, record, settings, simulator
-from muvo_jax.data.town import boxes as box_lib
-from muvo_jax.data.town import map as map_lib
 from muvo_jax.ops import camera as camera_ops
 from muvo_jax.ops import range_view, voxels
+from muvo_jax.town import Town, TownConfig, record, settings, simulator
+from muvo_jax.town import boxes as box_lib
+from muvo_jax.town import map as map_lib
 
 CONTRACT = config_lib.ActionContract()
 

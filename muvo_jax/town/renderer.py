@@ -10,12 +10,12 @@ from typing import Any
 
 import numpy as np
 
-from muvo_jax.data.town import boxes as box_lib
-from muvo_jax.data.town import ground as ground_lib
-from muvo_jax.data.town import labels, raycast, settings, shading
 from muvo_jax.ops import camera as camera_ops
 from muvo_jax.ops import range_view as range_ops
 from muvo_jax.ops import voxels as voxel_ops
+from muvo_jax.town import boxes as box_lib
+from muvo_jax.town import ground as ground_lib
+from muvo_jax.town import labels, raycast, settings, shading
 
 ROUTE_MAP_PX = 64
 ROUTE_MAP_EGO_ROW = 48

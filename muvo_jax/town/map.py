@@ -11,7 +11,7 @@ import dataclasses
 
 import numpy as np
 
-from muvo_jax.data.town import settings
+from muvo_jax.town import settings
 
 ROAD_HALF_M = 5.5  # a lane of 3.5 m and a parking strip of 2 m on each side of the middle
 LANE_OFFSET_M = 1.75

@@ -22,8 +22,8 @@ import numpy as np
 
 from muvo_jax import config as config_lib
 from muvo_jax.data import processes, recorder, schema
-from muvo_jax.data.town import driver, settings
-from muvo_jax.data.town.simulator import WEATHER_NAMES, Town, TownState
+from muvo_jax.town import driver, settings
+from muvo_jax.town.simulator import WEATHER_NAMES, Town, TownState
 
 # Raised by whatever changes the bytes of a recording, so that old caches are not taken for new ones.
 RECORDING_VERSION = 2
@@ -179,14 +179,14 @@ def _record_in_workers(directory: pathlib.Path, town_config: settings.TownConfig
                        workers: int) -> Iterator[int]:
     """Deals the runs out to worker processes and yields the frames they report, a few at a time."""
     environment = {**os.environ, "JAX_PLATFORMS": "cpu", "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
-    root = str(pathlib.Path(__file__).parents[3])
+    root = str(pathlib.Path(__file__).parents[2])
     environment["PYTHONPATH"] = os.pathsep.join(filter(None, [root, os.environ.get("PYTHONPATH")]))
     reports, report_end = os.pipe()
     children = []
     with os.fdopen(reports) as lines, tempfile.TemporaryFile("w+") as errors:
         try:
             for index in range(workers):
-                process = subprocess.Popen([sys.executable, "-m", "muvo_jax.data.town.record"], stdin=subprocess.PIPE,
+                process = subprocess.Popen([sys.executable, "-m", "muvo_jax.town.record"], stdin=subprocess.PIPE,
                                            stdout=report_end, stderr=errors, text=True, env=environment)
                 children.append(process)
                 order = json.dumps({"directory": str(directory), "town": dataclasses.asdict(town_config),

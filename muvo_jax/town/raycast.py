@@ -11,7 +11,7 @@ import dataclasses
 
 import numpy as np
 
-from muvo_jax.data.town import boxes as box_lib
+from muvo_jax.town import boxes as box_lib
 
 NOTHING, GROUND = -2, -1
 

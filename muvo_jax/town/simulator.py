@@ -13,10 +13,10 @@ from typing import Any
 import flax.struct
 import numpy as np
 
-from muvo_jax.data.town import boxes as box_lib
-from muvo_jax.data.town import driver, ground, renderer, scenery, settings
-from muvo_jax.data.town import map as map_lib
-from muvo_jax.data.town import traffic as traffic_lib
+from muvo_jax.town import boxes as box_lib
+from muvo_jax.town import driver, ground, renderer, scenery, settings
+from muvo_jax.town import map as map_lib
+from muvo_jax.town import traffic as traffic_lib
 
 # The ego origin is the ground under the middle of the rear axle.
 EGO_MIDDLE_M = 1.3

@@ -13,7 +13,7 @@ import numpy as np
 
 from muvo_jax.data import carla_drives, carla_frames
 
-EGO_BLUEPRINT = "vehicle.lincoln.mkz_2017"  # carla_files.EGO_BOX_M is its size
+EGO_BLUEPRINT = "vehicle.lincoln.mkz_2017"  # muvo.files.EGO_BOX_M is its size
 WARM_UP_TICKS = 20  # the car settles, sensors start
 _FASTEST_MPS = 30.0
 _WALKING_MPS = 1.4

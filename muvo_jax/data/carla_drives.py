@@ -10,7 +10,8 @@ from typing import NamedTuple
 import numpy as np
 
 from muvo_jax import config as config_lib
-from muvo_jax.data import carla, plain, recorder
+from muvo_jax.data import plain, recorder
+from muvo_jax.data.muvo import reader as muvo_reader
 
 # The paper's section IV: 25 runs of 300 s in each town for training, 5 in each for either validation set.
 TOWNS = ("Town01", "Town03", "Town04", "Town06")
@@ -38,16 +39,16 @@ class Settings:
 
     width_px: int = 960
     height_px: int = 600
-    fov_rad: float = carla.FOV_RAD
-    position_m: tuple[float, float, float] = carla.MOUNT_M
+    fov_rad: float = muvo_reader.FOV_RAD
+    position_m: tuple[float, float, float] = muvo_reader.MOUNT_M
     lidar_rows: int = 64
     lidar_range_m: float = 100.0
     points_per_frame: int = 60_000
-    rate_hz: float = carla.RATE_HZ
+    rate_hz: float = muvo_reader.RATE_HZ
 
     @property
     def lidar(self) -> config_lib.RangeViewGeometry:
-        return dataclasses.replace(carla.LIDAR, rows=self.lidar_rows, position_m=self.position_m)
+        return dataclasses.replace(muvo_reader.LIDAR, rows=self.lidar_rows, position_m=self.position_m)
 
     @property
     def raw_bytes(self) -> int:
@@ -67,7 +68,7 @@ class CarlaDrive(NamedTuple):
 
 
 def plan(*, towns: Sequence[str] = TOWNS, train_runs: int = 25, val_runs: int = 5, run_s: float = RUN_S,
-         rate_hz: float = carla.RATE_HZ, seed: int = 0) -> list[CarlaDrive]:
+         rate_hz: float = muvo_reader.RATE_HZ, seed: int = 0) -> list[CarlaDrive]:
     """The paper's runs: train, val_rl (same weathers) and val_ds (others), weathers drawn at random."""
     jobs = []
     runs_of, weathers_of = (train_runs, val_runs, val_runs), (WEATHERS, WEATHERS, SHIFTED_WEATHERS)

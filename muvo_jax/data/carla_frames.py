@@ -14,8 +14,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from PIL import Image, ImageDraw
 
-from muvo_jax.data import carla_files
 from muvo_jax.data.carla_drives import CarlaError, Settings
+from muvo_jax.data.muvo import files as muvo_files
 
 CAMERAS = ("image", "depth", "classes")
 SENSORS = (*CAMERAS, "lidar")
@@ -66,13 +66,13 @@ def decode(seen: Tick, settings: Settings) -> dict[str, np.ndarray]:
     """The measurements of a tick as recorder.RunWriter.write takes them."""
     pixels = {name: bgra(seen.measurements[name], name, settings) for name in CAMERAS}
     detections = np.frombuffer(seen.measurements["lidar"].raw_data, _DETECTION)
-    points_m = carla_files.to_ego_frame(detections["point"], settings.position_m)
-    keep = np.isfinite(points_m).all(axis=1) & ~carla_files.in_ego_box(points_m)
+    points_m = muvo_files.to_ego_frame(detections["point"], settings.position_m)
+    keep = np.isfinite(points_m).all(axis=1) & ~muvo_files.in_ego_box(points_m)
     return {"image": pixels["image"][..., 2::-1],
             # Blue is the most significant byte.
-            "depth_m": carla_files.DEPTH_RANGE_M * carla_files.decode_depth(pixels["depth"]),
-            "classes": carla_files.LAYOUT_TAGS[pixels["classes"][..., 2]], "points_m": points_m[keep],
-            "point_tags": carla_files.LAYOUT_TAGS[np.minimum(detections["tag"][keep], 255)]}
+            "depth_m": muvo_files.DEPTH_RANGE_M * muvo_files.decode_depth(pixels["depth"]),
+            "classes": muvo_files.LAYOUT_TAGS[pixels["classes"][..., 2]], "points_m": points_m[keep],
+            "point_tags": muvo_files.LAYOUT_TAGS[np.minimum(detections["tag"][keep], 255)]}
 
 
 def bgra(measurement: Any, name: str, settings: Settings) -> np.ndarray:

@@ -15,9 +15,11 @@ from typing import Protocol
 
 import numpy as np
 
-from muvo_jax.data import carla, carla_files, carla_frames, processes, recorder, schema
+from muvo_jax.data import carla_frames, processes, recorder, schema
 from muvo_jax.data.carla_drives import SPLITS, BadDriveError, CarlaDrive, CarlaError, Settings, estimate
 from muvo_jax.data.carla_frames import SENSORS, Tick
+from muvo_jax.data.muvo import files as muvo_files
+from muvo_jax.data.muvo import reader as muvo_reader
 
 ATTEMPTS = 3
 MOVING_MPS = 1.0
@@ -170,6 +172,6 @@ def check_written(folder: pathlib.Path, frames: int) -> None:
 def _describe(out: pathlib.Path, settings: Settings) -> None:
     camera = schema.Camera.level(settings.width_px, settings.height_px, settings.fov_rad, settings.position_m)
     recorder.write_description(out, name="CARLA", rate_hz=settings.rate_hz, camera=camera, lidar=settings.lidar,
-                               voxels=carla.VOXELS, splits=SPLITS,
-                               contract=dataclasses.replace(carla.CONTRACT, rate_hz=settings.rate_hz),
-                               classes=carla_files.CLASSES, route_map=carla.ROUTE_MAP)
+                               voxels=muvo_reader.VOXELS, splits=SPLITS,
+                               contract=dataclasses.replace(muvo_reader.CONTRACT, rate_hz=settings.rate_hz),
+                               classes=muvo_files.CLASSES, route_map=muvo_reader.ROUTE_MAP)

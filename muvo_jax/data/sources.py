@@ -6,7 +6,9 @@ import pathlib
 from collections.abc import Callable, Collection
 from typing import Any, NamedTuple
 
-from muvo_jax.data import carla, carla_runs, files, kitti, manifest, plain, records, schema
+from muvo_jax.data import files, kitti, manifest, plain, records, schema
+from muvo_jax.data.muvo import reader as muvo_reader
+from muvo_jax.data.muvo import runs as muvo_runs
 
 
 class Kind(NamedTuple):
@@ -37,8 +39,8 @@ KINDS = (
          lambda path: (path / plain.DESCRIPTION_FILE).is_file(), plain.PlainRecording),
     Kind("KITTI raw", "<date>/<date>_drive_NNNN_sync folders, or one of them",
          lambda path: bool(kitti.find_drives(path)), kitti.KittiRecording, kitti.CAMERAS, options=("camera",)),
-    Kind("MUVO CARLA", f"trainval/<mode>/<Town>/<run> folders with {carla_runs.FRAME_FILE}, or one of them",
-         lambda path: bool(carla_runs.folders(path)), carla.CarlaRecording),
+    Kind("MUVO CARLA", f"trainval/<mode>/<Town>/<run> folders with {muvo_runs.FRAME_FILE}, or one of them",
+         lambda path: bool(muvo_runs.folders(path)), muvo_reader.MuvoRecording),
 )
 
 

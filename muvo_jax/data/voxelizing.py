@@ -26,19 +26,11 @@ from typing import NamedTuple
 import numpy as np
 
 from muvo_jax import config as config_lib
-from muvo_jax.data import (
-    carla,
-    carla_files,
-    carla_runs,
-    description,
-    files,
-    frame_pickle,
-    plain,
-    processes,
-    recorder,
-    safe_pickle,
-    schema,
-)
+from muvo_jax.data import description, files, plain, processes, recorder, schema
+from muvo_jax.data.muvo import files as muvo_files
+from muvo_jax.data.muvo import frame_pickle, safe_pickle
+from muvo_jax.data.muvo import reader as muvo_reader
+from muvo_jax.data.muvo import runs as muvo_runs
 from muvo_jax.ops import camera as camera_ops
 from muvo_jax.ops import voxels as voxel_ops
 
@@ -192,12 +184,12 @@ def _survey(path: pathlib.Path, rule: str) -> tuple[Rig, dict[pathlib.Path, list
     """What is measured with, and the frames of every run by its folder; checks that there is depth and lidar."""
     if (path / plain.DESCRIPTION_FILE).is_file():
         rig, runs = _survey_plain(path, rule)
-    elif path.is_dir() and carla_runs.folders(path):
+    elif path.is_dir() and muvo_runs.folders(path):
         rig, runs = _survey_muvo(path, rule)
     else:
         raise schema.DataError(f"{path} is no recording whose occupancy can be made; expected a plain one (a folder "
                                f"with {plain.DESCRIPTION_FILE}) or runs of the MUVO layout (with "
-                               f"{carla_runs.FRAME_FILE}).")
+                               f"{muvo_runs.FRAME_FILE}).")
     for folder, frames in runs.items():
         for what, places in (("depth map", {frame.depth for frame in frames}),
                              ("lidar scan", {frame.points for frame in frames})):
@@ -225,20 +217,20 @@ def _survey_plain(path: pathlib.Path, rule: str) -> tuple[Rig, dict[pathlib.Path
 
 
 def _survey_muvo(path: pathlib.Path, rule: str) -> tuple[Rig, dict[pathlib.Path, list[Frame]]]:
-    toml_path = path / carla.SENSORS_FILE
+    toml_path = path / muvo_reader.SENSORS_FILE
     header = files.read_toml(toml_path) if toml_path.is_file() else {}
     camera, lidar, grid = (description.section(header, name, toml_path, required=False)
                            for name in ("camera", "lidar", "voxels"))
     runs = {}
-    for run in carla_runs.find_runs(path):
+    for run in muvo_runs.find_runs(path):
         lacking = [kind for kind in ("depth_semantic", "points_semantic") if f"{kind}_path" not in run.columns]
         if lacking:
-            raise schema.DataError(f"{run.folder / carla_runs.FRAME_FILE}: no column {lacking[0]}_path; occupancy is "
+            raise schema.DataError(f"{run.folder / muvo_runs.FRAME_FILE}: no column {lacking[0]}_path; occupancy is "
                                    f"made from depth and lidar. Record both.")
-        name = carla.occupancy_name if rule == "carved" else lambda row: carla_files.file_name("voxel", row)
+        name = muvo_reader.occupancy_name if rule == "carved" else lambda row: muvo_files.file_name("voxel", row)
         runs[run.folder] = [Frame(run.path("depth_semantic", row), run.path("points_semantic", row),
                                   run.folder / name(row)) for row in range(run.frames)]
-    return Rig(True, rule, camera, (lidar or carla.LIDAR).position_m, grid or carla.VOXELS), runs
+    return Rig(True, rule, camera, (lidar or muvo_reader.LIDAR).position_m, grid or muvo_reader.VOXELS), runs
 
 
 def _clear(folder: pathlib.Path, rule_text: str, overwrite: bool) -> None:
@@ -257,14 +249,14 @@ def _clear(folder: pathlib.Path, rule_text: str, overwrite: bool) -> None:
 def _content(rig: Rig, frame: Frame) -> bytes:
     """The bytes of the frame's new file."""
     if rig.is_muvo:
-        depth, tags = carla_files.read_depth_semantic(frame.depth)
-        scan = carla_files.read_points(frame.points, rig.lidar_position_m)
+        depth, tags = muvo_files.read_depth_semantic(frame.depth)
+        scan = muvo_files.read_points(frame.points, rig.lidar_position_m)
         if rig.rule == "reference":
             file = io.BytesIO()
-            np.save(file, _reference_table(rig, frame, depth * carla_files.DEPTH_RANGE_M, tags, scan))
+            np.save(file, _reference_table(rig, frame, depth * muvo_files.DEPTH_RANGE_M, tags, scan))
             return file.getvalue()
         keep: Callable[[np.ndarray], np.ndarray] = _without_own_car
-        depth_m, points_m = np.where(depth < 1.0, depth * carla_files.DEPTH_RANGE_M, np.inf), scan.points_m
+        depth_m, points_m = np.where(depth < 1.0, depth * muvo_files.DEPTH_RANGE_M, np.inf), scan.points_m
     else:
         depth_m = plain.decode_depth(files.read_image(frame.depth, None))
         points_m = files.read_npz(frame.points, "points_m").astype(np.float32)
@@ -284,24 +276,24 @@ def _content(rig: Rig, frame: Frame) -> bytes:
 
 
 def _reference_table(rig: Rig, frame: Frame, depth_m: np.ndarray, tags: np.ndarray,
-                     scan: carla_files.Points) -> np.ndarray:
+                     scan: muvo_files.Points) -> np.ndarray:
     if scan.tags is None:
         raise schema.DataError(f"{frame.points}: no ObjTag, what each point hit; the reference rule labels with it. "
                                f"Use the rule {RULES[0]}.")
-    fov_rad, position_m = carla.FOV_RAD, carla.MOUNT_M
+    fov_rad, position_m = muvo_reader.FOV_RAD, muvo_reader.MOUNT_M
     if rig.camera is not None:
         intrinsics, camera_to_ego = _pinhole(rig.camera, depth_m.shape, frame.depth)
         centre_px = (depth_m.shape[1] / 2, depth_m.shape[0] / 2)
         if not (np.allclose(camera_to_ego[:3, :3], _LEVEL) and np.allclose(intrinsics[:2, 2], centre_px)):
-            raise schema.DataError(f"{carla.SENSORS_FILE}: the reference rule knows only level cameras with a centred "
-                                   f"principal point. Use the rule {RULES[0]}.")
+            raise schema.DataError(f"{muvo_reader.SENSORS_FILE}: the reference rule knows only level cameras with a "
+                                   f"centred principal point. Use the rule {RULES[0]}.")
         fov_rad = 2.0 * math.atan(0.5 * depth_m.shape[1] / float(intrinsics[0, 0]))
         x_m, y_m, z_m = map(float, camera_to_ego[:3, 3])
         position_m = (x_m, y_m, z_m)
     seen_m, pixel = camera_ops.reference_depth_points(depth_m, fov_rad, position_m)
     points_m, hit = np.concatenate([seen_m, scan.points_m]), np.concatenate([tags.reshape(-1)[pixel], scan.tags])
-    kept = ~carla_files.in_ego_box(points_m)
-    return voxel_ops.voxel_table(points_m[kept], hit[kept], rig.grid, winning_tag=carla_files.ROAD_LINE)
+    kept = ~muvo_files.in_ego_box(points_m)
+    return voxel_ops.voxel_table(points_m[kept], hit[kept], rig.grid, winning_tag=muvo_files.ROAD_LINE)
 
 
 def _all(points_m: np.ndarray) -> np.ndarray:
@@ -309,15 +301,15 @@ def _all(points_m: np.ndarray) -> np.ndarray:
 
 
 def _without_own_car(points_m: np.ndarray) -> np.ndarray:
-    return points_m[~carla_files.in_ego_box(points_m)]
+    return points_m[~muvo_files.in_ego_box(points_m)]
 
 
 def _pinhole(camera: schema.Camera | None, shape: tuple[int, ...],
              path: pathlib.Path) -> tuple[np.ndarray, np.ndarray]:
     height_px, width_px = shape
     if camera is None:
-        return (camera_ops.intrinsics_from_fov(width_px, height_px, carla.FOV_RAD),
-                camera_ops.level_camera_to_ego(carla.MOUNT_M))
+        return (camera_ops.intrinsics_from_fov(width_px, height_px, muvo_reader.FOV_RAD),
+                camera_ops.level_camera_to_ego(muvo_reader.MOUNT_M))
     if (camera.width_px, camera.height_px) != (width_px, height_px):
         raise schema.DataError(f"{path}: {width_px}x{height_px} pixels, but the camera is described with "
                                f"{camera.width_px}x{camera.height_px}; depth must be that of the image.")
@@ -326,7 +318,7 @@ def _pinhole(camera: schema.Camera | None, shape: tuple[int, ...],
 
 def _add_column(folder: pathlib.Path, frames: list[Frame]) -> None:
     """Tells the data frame where the voxels are, as the authors' tool does; the original is kept beside it."""
-    path = folder / carla_runs.FRAME_FILE
+    path = folder / muvo_runs.FRAME_FILE
     columns = safe_pickle.load_table(path)
     if "voxel_path" in columns:
         return

@@ -14,7 +14,6 @@ from muvo_jax import command_line, record_carla
 from muvo_jax.data import (
     carla_client,
     carla_drives,
-    carla_files,
     carla_frames,
     carla_recorder,
     plain,
@@ -22,6 +21,7 @@ from muvo_jax.data import (
     recorder,
     voxelizing,
 )
+from muvo_jax.data.muvo import files as muvo_files
 
 SETTINGS = carla_drives.Settings(width_px=24, height_px=16, points_per_frame=50)
 JOB = carla_drives.CarlaDrive("train", "Town01_000", "Town01", "ClearNoon", 3, 14)
@@ -88,7 +88,7 @@ def test_a_drive_is_a_plain_recording_in_the_ego_frame(tmp_path):
     # y right becomes y left, the mount is added, and what hit the own car is gone.
     np.testing.assert_allclose(frame["points_m"], [[14, -4, 0], [21, 3, 3]], atol=1e-6)
     with np.load(tmp_path / "train/Town01_000/lidar/000003.npz") as arrays:
-        assert arrays["point_tags"].tolist() == [carla_files.ROAD_LINE, carla_files.VEHICLE]
+        assert arrays["point_tags"].tolist() == [muvo_files.ROAD_LINE, muvo_files.VEHICLE]
     np.testing.assert_allclose(frame["action"], [0.5, 0.04])  # of the tick after: it led there
     assert frame["speed_mps"] == 5 and frame["yaw_rate_radps"] == 0
     pixels = np.frombuffer(FakeSimulator.observe(types.SimpleNamespace(
@@ -144,7 +144,7 @@ def test_depth_and_tags_come_from_the_clients_channels():
     frame = carla_frames.decode(seen, SETTINGS)
     np.testing.assert_allclose(frame["depth_m"][0, :3], np.array([1, 2 ** 24 - 1, 2 ** 20]) * 1000 / (2 ** 24 - 1))
     assert recorder.encode_depth(frame["depth_m"])[0, 1] == recorder.DEPTH_SKY
-    assert frame["classes"][0, :2].tolist() == [carla_files.SKY, 7]
+    assert frame["classes"][0, :2].tolist() == [muvo_files.SKY, 7]
 
 
 def test_route_bends_to_the_left_in_the_picture_where_it_bends_to_the_left():
@@ -281,8 +281,8 @@ def test_tags_and_poses_agree_with_the_clients_types():
     tags = {name: int(value) for name, value in carla.CityObjectLabel.names.items() if name != "Any"}
     for name, expected in {"Roads": 7, "RoadLines": 6, "Sky": 13, "Car": 10, "Bus": 10, "Pedestrians": 4,
                            "Buildings": 1, "NONE": 0, "Terrain": 22, "TrafficLight": 18, "Water": 21}.items():
-        assert carla_files.LAYOUT_TAGS[tags[name]] == expected, name
-    assert all(carla_files.LAYOUT_TAGS[tag] for name, tag in tags.items() if name != "NONE")
+        assert muvo_files.LAYOUT_TAGS[tags[name]] == expected, name
+    assert all(muvo_files.LAYOUT_TAGS[tag] for name, tag in tags.items() if name != "NONE")
     placed = carla.Transform(carla.Location(3, 4, 0), carla.Rotation(yaw=90, pitch=10))
     assert carla_frames.pose_of(placed) == pytest.approx((3, -4, -math.pi / 2))
     forward = placed.get_forward_vector()

@@ -7,7 +7,8 @@ import pytest
 import recording_samples as samples
 
 from muvo_jax import presets
-from muvo_jax.data import carla, pipeline, plain, prepare, schema
+from muvo_jax.data import pipeline, plain, prepare, schema
+from muvo_jax.data.muvo import reader as muvo_reader
 from muvo_jax.ops import camera, range_view
 from muvo_jax.town import boxes, record, settings
 from muvo_jax.town.simulator import Town
@@ -99,7 +100,7 @@ def test_a_nearest_crop_shows_the_pixels_of_the_image():
 
 @pytest.mark.skipif(samples.MUVO_LAYOUT is None, reason="needs a recording in the MUVO layout (MUVO_LAYOUT)")
 def test_the_muvo_layout_gives_all_labels():
-    recording = carla.CarlaRecording(samples.MUVO_LAYOUT, labels=schema.LABELS)
+    recording = muvo_reader.MuvoRecording(samples.MUVO_LAYOUT, labels=schema.LABELS)
     raw = recording.read(recording.sequences[0], 0)
     assert raw.keys() >= schema.LABELS and len(recording.description.classes) == 23
     assert raw["depth_m"].shape == raw["image_classes"].shape == raw["image"].shape[:2]

@@ -9,7 +9,10 @@ import recording_writers as writers
 from PIL import Image
 
 from muvo_jax import voxelize as command
-from muvo_jax.data import carla, carla_runs, plain, recorder, safe_pickle, schema, voxelizing
+from muvo_jax.data import plain, recorder, schema, voxelizing
+from muvo_jax.data.muvo import reader as muvo_reader
+from muvo_jax.data.muvo import runs as muvo_runs
+from muvo_jax.data.muvo import safe_pickle
 
 needs_layout = pytest.mark.skipif(samples.MUVO_LAYOUT is None,
                                   reason="no recording in the MUVO layout here; name one by MUVO_LAYOUT=FOLDER")
@@ -131,14 +134,14 @@ def layout(tmp_path):
 @needs_layout
 def test_the_reference_rule_writes_the_authors_voxels(layout):
     run = layout / "trainval/train/Town01/0000"
-    table = safe_pickle.load_table(run / carla_runs.FRAME_FILE)
+    table = safe_pickle.load_table(run / muvo_runs.FRAME_FILE)
     shutil.rmtree(run / "voxel")
     columns = {name: cells[:12] for name, cells in table.items() if name != "voxel_path"}
-    (run / carla_runs.FRAME_FILE).write_bytes(voxelizing.frame_pickle.frame(columns))
+    (run / muvo_runs.FRAME_FILE).write_bytes(voxelizing.frame_pickle.frame(columns))
     assert voxelizing.voxelize(layout, rule="reference", workers=2) == (12, 0)
     for path in (run / "voxel").glob("*.npy"):
         assert path.read_bytes() == (samples.MUVO_LAYOUT / path.relative_to(layout)).read_bytes()
-    written = safe_pickle.load_table(run / carla_runs.FRAME_FILE)
+    written = safe_pickle.load_table(run / muvo_runs.FRAME_FILE)
     assert list(written) == list(table) and list(written["voxel_path"]) == list(table["voxel_path"][:12])
     for name in columns:
         for old, new in zip(columns[name], written[name], strict=True):
@@ -149,14 +152,14 @@ def test_the_reference_rule_writes_the_authors_voxels(layout):
 @needs_layout
 def test_carved_occupancy_of_the_layout_is_read_in_place_of_its_voxels(layout):
     run = layout / "trainval/train/Town01/0000"
-    table = safe_pickle.load_table(run / carla_runs.FRAME_FILE)
-    (run / carla_runs.FRAME_FILE).write_bytes(voxelizing.frame_pickle.frame(
+    table = safe_pickle.load_table(run / muvo_runs.FRAME_FILE)
+    (run / muvo_runs.FRAME_FILE).write_bytes(voxelizing.frame_pickle.frame(
         {name: cells[:12] for name, cells in table.items()}))
-    opened = carla.CarlaRecording(layout)
+    opened = muvo_reader.MuvoRecording(layout)
     theirs = opened.read(opened.sequences[0], 1)["occupancy"]
     before = (run / "voxel/voxel_000000011.npy").read_bytes()
     assert voxelizing.voxelize(layout, workers=1).made == 12
-    opened = carla.CarlaRecording(layout)
+    opened = muvo_reader.MuvoRecording(layout)
     frame = opened.read(opened.sequences[0], 1)
     ours = frame["occupancy"]
     assert set(np.unique(ours)) == {0, 1, 255}

@@ -17,7 +17,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from muvo_jax.data import files, schema
-from muvo_jax.data import pickle_standins as standins
+from muvo_jax.data.muvo import pickle_standins as standins
 
 _OPCODES = frozenset((
     pickle.PROTO, pickle.FRAME, pickle.STOP, pickle.MARK, pickle.POP, pickle.POP_MARK, pickle.NONE, pickle.NEWTRUE,

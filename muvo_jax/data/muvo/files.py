@@ -21,7 +21,8 @@ import numpy as np
 import scipy.ndimage
 
 from muvo_jax import config as config_lib
-from muvo_jax.data import files, safe_pickle, schema
+from muvo_jax.data import files, schema
+from muvo_jax.data.muvo import safe_pickle
 
 KINDS = {"image": ".png", "depth_semantic": ".png", "birdview": ".png", "routemap": ".png", "points_semantic": ".npy",
          "voxel": ".npy"}

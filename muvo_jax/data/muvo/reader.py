@@ -1,6 +1,6 @@
 """Recordings in the MUVO / MILE CARLA layout, exactly as the authors' DataWriter and generate_voxels leave them.
 
-    ROOT/trainval/<mode>/<Town>/<run>/pd_dataframe.pkl    one row a frame, paths relative to the run (carla_runs.py)
+    ROOT/trainval/<mode>/<Town>/<run>/pd_dataframe.pkl    one row a frame, paths relative to the run (runs.py)
     ROOT/trainval/<mode>/<Town>/<run>/occupancy/*.npz     ours, optional: muvo_jax.voxelize separates empty and unknown
     ROOT/sensors.toml                                     ours, optional: rate_hz, tags, and the sections [camera],
                                                           [lidar], [voxels], [action], [route_map]
@@ -24,7 +24,10 @@ import pathlib
 import numpy as np
 
 from muvo_jax import config as config_lib
-from muvo_jax.data import carla_files, carla_runs, carla_tags, description, ego_motion, fields, files, runs, schema
+from muvo_jax.data import description, ego_motion, fields, files, runs, schema
+from muvo_jax.data.muvo import files as muvo_files
+from muvo_jax.data.muvo import runs as muvo_runs
+from muvo_jax.data.muvo import tags as muvo_tags
 
 SENSORS_FILE = "sensors.toml"
 OCCUPANCY_FOLDER = "occupancy"
@@ -47,7 +50,7 @@ _LABEL_FILES = {"depth_m": "depth_semantic", "image_classes": "depth_semantic",
                 "birds_eye_classes": "birdview", "birds_eye_instances": "birdview"}
 
 
-class CarlaRecording:
+class MuvoRecording:
     """A folder in the MUVO / MILE CARLA layout."""
 
     def __init__(self, path: pathlib.Path | str, *, min_mean_reward: float = MIN_MEAN_REWARD,
@@ -68,7 +71,7 @@ class CarlaRecording:
         header = files.read_toml(sensors_path) if sensors_path.is_file() else {}
         description.check_names(header, sensors_path, ("rate_hz", "tags"))
         rate_hz = description.rate_hz(header, sensors_path) if "rate_hz" in header else RATE_HZ
-        every = carla_runs.find_runs(path)
+        every = muvo_runs.find_runs(path)
         kept = [run for run in every if run.frames and not run.mean_reward < min_mean_reward]
         if not kept:
             raise schema.DataError(f"{path}: none of its {len(every)} runs has frames and a mean reward of "
@@ -79,7 +82,7 @@ class CarlaRecording:
             kinds["occupancy"] = OCCUPANCY_FOLDER
             kept = [_with_occupancy(run) for run in kept]
         self._kinds = kinds
-        self._files = {run.name: {kind: carla_runs.find_files(run, kind) for kind in set(kinds.values())}
+        self._files = {run.name: {kind: muvo_runs.find_files(run, kind) for kind in set(kinds.values())}
                        for run in kept}
         modalities, lacks = runs.shared([runs.Run(run.name, run.split, run.frames, self._fields_of(run))
                                          for run in kept], str(path))
@@ -97,13 +100,13 @@ class CarlaRecording:
             camera=(section("camera") or self._assumed_camera(kept)) if "image" in modalities else None,
             lidar=(section("lidar") or LIDAR) if "points_m" in modalities else None,
             voxels=(section("voxels") or VOXELS) if "occupancy" in modalities else None,
-            classes=carla_files.CLASSES if labels & {"image_classes", "point_classes"} else (),
+            classes=muvo_files.CLASSES if labels & {"image_classes", "point_classes"} else (),
             route_map=(section("route_map") or ROUTE_MAP) if "route_map" in modalities else None,
             contract=description.contract(header, sensors_path, rate_hz)
             or dataclasses.replace(CONTRACT, rate_hz=rate_hz))
-        self._tags = carla_tags.described(header, sensors_path) or self._recognised_tags(kept, path)
+        self._tags = muvo_tags.described(header, sensors_path) or self._recognised_tags(kept, path)
 
-    def run(self, name: str) -> carla_runs.Run:
+    def run(self, name: str) -> muvo_runs.Run:
         """The run of a sequence, for what RawFrame does not hold."""
         return self._runs[name]
 
@@ -125,33 +128,33 @@ class CarlaRecording:
             frame["intrinsics"] = np.asarray(camera.intrinsics, np.float32)
             frame["camera_to_ego"] = np.asarray(camera.camera_to_ego, np.float32)
         if described.lidar is not None and "points_m" in paths:
-            scan = carla_files.read_points(paths["points_m"], described.lidar.position_m)
+            scan = muvo_files.read_points(paths["points_m"], described.lidar.position_m)
             frame["points_m"] = fields.conform("points_m", scan.points_m, str(paths["points_m"]))
             if "point_classes" in paths:
-                frame["point_classes"] = self._translate(carla_files.point_tags(scan, paths["points_m"]),
+                frame["point_classes"] = self._translate(muvo_files.point_tags(scan, paths["points_m"]),
                                                          paths["points_m"])
         if described.voxels is not None and "occupancy" in paths:
             frame["occupancy"] = (_read_occupancy(paths["occupancy"], described.voxels) if self._is_carved else
-                                  carla_files.read_voxels(paths["occupancy"], described.voxels, self._translate))
+                                  muvo_files.read_voxels(paths["occupancy"], described.voxels, self._translate))
         if "route_map" in paths:
-            frame["route_map"] = _nearest(carla_files.read_route_map(paths["route_map"]), _ROUTE_PX)
-        return frame | carla_files.read_labels(paths, described.voxels or VOXELS, self._translate)
+            frame["route_map"] = _nearest(muvo_files.read_route_map(paths["route_map"]), _ROUTE_PX)
+        return frame | muvo_files.read_labels(paths, described.voxels or VOXELS, self._translate)
 
     def action(self, sequence: schema.Sequence, index: int) -> np.ndarray:
         """See schema.Recording."""
         return self._columns[sequence.name]["action"][sequence.start + index]
 
-    def _path(self, run: carla_runs.Run, kind: str, row: int) -> pathlib.Path:
+    def _path(self, run: muvo_runs.Run, kind: str, row: int) -> pathlib.Path:
         return self._files[run.name][kind].unusual.get(row) or run.path(kind, row)
 
-    def _fields_of(self, run: carla_runs.Run) -> frozenset[str]:
+    def _fields_of(self, run: muvo_runs.Run) -> frozenset[str]:
         found = {"speed_mps", "action", "reward", "is_terminal", "timestamp_s", "frame_id"}
         if "imu" in run.columns:
             found |= {"yaw_rate_radps", "pose"}
         return frozenset(found | {key for key, kind in self._kinds.items()
                                   if runs.has_files(self._files[run.name][kind].present)})
 
-    def _cut(self, run: carla_runs.Run, modalities: frozenset[str], lacks: tuple[str, ...], skipped_s: float,
+    def _cut(self, run: muvo_runs.Run, modalities: frozenset[str], lacks: tuple[str, ...], skipped_s: float,
              rate_hz: float) -> list[schema.Sequence]:
         """The gap-free sequences of a run after its first second; warns of gaps."""
         present, absent = np.ones(run.frames, bool), {}
@@ -167,7 +170,7 @@ class CarlaRecording:
         cut = [(max(start, first), start + length) for start, length in pieces]
         return [schema.Sequence(run.split, run.name, start, stop - start, lacks) for start, stop in cut if stop > start]
 
-    def _assumed_camera(self, kept: list[carla_runs.Run]) -> schema.Camera:
+    def _assumed_camera(self, kept: list[muvo_runs.Run]) -> schema.Camera:
         """The authors', with the size of the first image there is."""
         first = next(self._path(run, "image", int(np.argmax(there))) for run in kept
                      if (there := self._files[run.name]["image"].present).any())
@@ -175,9 +178,9 @@ class CarlaRecording:
         return schema.Camera.level(width_px, height_px, FOV_RAD, MOUNT_M)
 
     def _translate(self, tags: np.ndarray, path: pathlib.Path) -> np.ndarray:
-        return carla_tags.to_layout(tags, self._tags, path)
+        return muvo_tags.to_layout(tags, self._tags, path)
 
-    def _recognised_tags(self, kept: list[carla_runs.Run], path: pathlib.Path) -> carla_tags.TagSet | None:
+    def _recognised_tags(self, kept: list[muvo_runs.Run], path: pathlib.Path) -> muvo_tags.TagSet | None:
         """The tag set by what some files hold; None where nothing read needs one, or occupancy alone does.
 
         Raises:
@@ -189,47 +192,47 @@ class CarlaRecording:
         every, ground = [], []
         for run in kept[:: max(len(kept) // _TAGGED_RUNS, 1)]:
             for row in {run.frames // 4, run.frames // 2}:
-                found = carla_tags.of_frame(run, row)
+                found = muvo_tags.of_frame(run, row)
                 every += found.every
                 ground += found.ground
-        tag_set = carla_tags.recognise(every, ground, str(path))
+        tag_set = muvo_tags.recognise(every, ground, str(path))
         if tag_set is None and wanted:
-            raise carla_tags.undecided(str(path))
+            raise muvo_tags.undecided(str(path))
         return tag_set
 
 
 def _sensors_path(path: pathlib.Path) -> pathlib.Path:
     """sensors.toml in this folder of the layout or the nearest one above it, up to the recording's root."""
-    above = [path.resolve(), *path.resolve().parents][:carla_runs.root_levels(path) + 1]
+    above = [path.resolve(), *path.resolve().parents][:muvo_runs.root_levels(path) + 1]
     return next((folder / SENSORS_FILE for folder in above if (folder / SENSORS_FILE).is_file()), path / SENSORS_FILE)
 
 
-def _is_carved(kept: list[carla_runs.Run]) -> bool:
+def _is_carved(kept: list[muvo_runs.Run]) -> bool:
     """Whether the runs with most of the frames have occupancy of ours."""
     carved = sum(run.frames for run in kept if any((run.folder / OCCUPANCY_FOLDER).glob("*.npz")))
     return 2 * carved >= sum(run.frames for run in kept)
 
 
-def _columns(run: carla_runs.Run, rate_hz: float, is_stated: bool) -> dict[str, np.ndarray]:
+def _columns(run: muvo_runs.Run, rate_hz: float, is_stated: bool) -> dict[str, np.ndarray]:
     """What RawFrame has of the table, by its names: [F, ...].
 
     Raises:
       DataError: for numbers that a field cannot have, or frames that are numbered in other steps than 1 while no rate
         is stated.
     """
-    where = str(run.folder / carla_runs.FRAME_FILE)
-    numbers = carla_runs.numbering(run)
+    where = str(run.folder / muvo_runs.FRAME_FILE)
+    numbers = muvo_runs.numbering(run)
     steps, counts = np.unique(np.diff(numbers), return_counts=True)
     step = int(steps[np.argmax(counts)]) if steps.size else 1
     if step != 1 and not is_stated:
         raise schema.DataError(f"{where}: frames are numbered in steps of {step}. If {step - 1} of {step} were taken "
                                f"out, say rate_hz = {RATE_HZ / step:g} in {SENSORS_FILE}.")
-    columns = {"action": carla_runs.actions(run), "speed_mps": run.numbers("speed", 1)[:, 0],
+    columns = {"action": muvo_runs.actions(run), "speed_mps": run.numbers("speed", 1)[:, 0],
                "reward": np.clip(run.numbers("reward", 1)[:, 0], -1.0, 1.0),
                "is_terminal": np.zeros(run.frames, bool), "frame_id": np.arange(run.frames),
                "timestamp_s": (numbers - numbers[0]) / (step * rate_hz)}
     if "imu" in run.columns:
-        columns["yaw_rate_radps"] = carla_runs.yaw_rates(run)
+        columns["yaw_rate_radps"] = muvo_runs.yaw_rates(run)
         columns["pose"] = ego_motion.dead_reckoned(columns["speed_mps"], columns["yaw_rate_radps"], rate_hz)
     for name in ("action", "speed_mps", "yaw_rate_radps"):
         if name in columns:
@@ -242,7 +245,7 @@ def occupancy_name(row: int) -> str:
     return f"{OCCUPANCY_FOLDER}/{OCCUPANCY_FOLDER}_{row:09d}.npz"
 
 
-def _with_occupancy(run: carla_runs.Run) -> carla_runs.Run:
+def _with_occupancy(run: muvo_runs.Run) -> muvo_runs.Run:
     names = [occupancy_name(row) for row in range(run.frames)]
     return dataclasses.replace(run, columns=run.columns | {f"{OCCUPANCY_FOLDER}_path": names})
 
@@ -261,7 +264,7 @@ def _nearest(picture: np.ndarray, side: int) -> np.ndarray:
     return np.ascontiguousarray(picture[rows[:, None], columns])
 
 
-def _notes(every: list[carla_runs.Run], kept: list[carla_runs.Run], min_mean_reward: float, *,
+def _notes(every: list[muvo_runs.Run], kept: list[muvo_runs.Run], min_mean_reward: float, *,
            is_binary: bool) -> tuple[str, ...]:
     notes = ["MUVO layout: an action is (throttle where pressed, else -brake; steering); pedals, not accelerations."]
     if len(kept) < len(every):

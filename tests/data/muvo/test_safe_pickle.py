@@ -11,9 +11,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from muvo_jax.data import pickle_standins, safe_pickle, schema
+from muvo_jax.data import schema
+from muvo_jax.data.muvo import pickle_standins, safe_pickle
 
-FOLDER = pathlib.Path(__file__).parents[1] / "golden" / "pickles"
+FOLDER = pathlib.Path(__file__).parents[2] / "golden" / "pickles"
 FRAMES = sorted(FOLDER.glob("*.pkl"))
 
 

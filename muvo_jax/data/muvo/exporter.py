@@ -1,6 +1,6 @@
 """Plain recordings written in the MUVO layout, as the authors' DataWriter leaves them, for their code to read.
 
-    OUT/trainval/<mode>/<Town>/<run>/...    see carla_files.py; one run for each gap-free sequence
+    OUT/trainval/<mode>/<Town>/<run>/...    see files.py; one run for each gap-free sequence
     OUT/sensors.toml                        ours: where the sensors sit (the authors' code passes it over)
     OUT/runs.csv                            mode, town, run, and the run of the source that it is
 
@@ -23,17 +23,12 @@ from collections.abc import Callable, Iterator
 import numpy as np
 from PIL import Image
 
-from muvo_jax.data import (
-    carla,
-    carla_files,
-    carla_runs,
-    carla_tags,
-    description,
-    frame_pickle,
-    plain,
-    recorder,
-    schema,
-)
+from muvo_jax.data import description, plain, recorder, schema
+from muvo_jax.data.muvo import files as muvo_files
+from muvo_jax.data.muvo import frame_pickle
+from muvo_jax.data.muvo import reader as muvo_reader
+from muvo_jax.data.muvo import runs as muvo_runs
+from muvo_jax.data.muvo import tags as muvo_tags
 
 # What the town's classes are in CARLA's tags (town/boxes.py: sky, road, marking, pavement, grass, building, ...).
 TOWN_TAGS = np.array([13, 7, 6, 8, 22, 1, 9, 5, 10, 4], np.uint8)
@@ -72,8 +67,8 @@ def export(source: pathlib.Path | str, out: pathlib.Path | str, *, town: str = "
     runs = _plan(recording, town)
     total, written = sum(sequence.length for _, sequence in runs), 0
     for folder, sequence in runs:
-        target = out / carla_runs.VERSION_FOLDER / folder
-        if not (target / carla_runs.FRAME_FILE).is_file():
+        target = out / muvo_runs.VERSION_FOLDER / folder
+        if not (target / muvo_runs.FRAME_FILE).is_file():
             for _ in _write_run(recording, sequence, target):
                 written += 1
                 if progress is not None:
@@ -97,12 +92,12 @@ def _check(recording: plain.PlainRecording, source: pathlib.Path) -> None:
 
 
 def _describe(described: schema.RecordingDescription, out: pathlib.Path) -> None:
-    voxels = described.voxels if described.voxels == carla.VOXELS else None
-    route_map = described.route_map if described.route_map != carla.ROUTE_MAP else None
-    text = recorder.to_toml({"rate_hz": described.rate_hz, "tags": carla_tags.OLDER},
+    voxels = described.voxels if described.voxels == muvo_reader.VOXELS else None
+    route_map = described.route_map if described.route_map != muvo_reader.ROUTE_MAP else None
+    text = recorder.to_toml({"rate_hz": described.rate_hz, "tags": muvo_tags.OLDER},
                             description.tables(camera=described.camera, lidar=described.lidar,
                                                action=described.contract, voxels=voxels, route_map=route_map))
-    path = out / carla.SENSORS_FILE
+    path = out / muvo_reader.SENSORS_FILE
     if path.is_file() and path.read_text(encoding="utf-8") != text:
         raise FileExistsError(f"{path} describes other sensors; choose another folder or remove this one.")
     out.mkdir(parents=True, exist_ok=True)
@@ -127,10 +122,10 @@ def _plan(recording: plain.PlainRecording, town: str) -> list[tuple[str, schema.
 def _write_run(recording: plain.PlainRecording, sequence: schema.Sequence, target: pathlib.Path) -> Iterator[int]:
     """Writes one run, the data frame last; yields after each frame."""
     shutil.rmtree(target, ignore_errors=True)
-    for kind in (*carla_files.KINDS, "image_left", "image_right", "image_all"):
+    for kind in (*muvo_files.KINDS, "image_left", "image_right", "image_all"):
         (target / kind).mkdir(parents=True)
     described = recording.description
-    has_voxels = described.voxels == carla.VOXELS and "occupancy" in described.modalities
+    has_voxels = described.voxels == muvo_reader.VOXELS and "occupancy" in described.modalities
     if not has_voxels:
         (target / "voxel").rmdir()
     rows = []
@@ -142,9 +137,9 @@ def _write_run(recording: plain.PlainRecording, sequence: schema.Sequence, targe
     weathers = recording.words(sequence, "weather") or [""] * len(rows)
     content = frame_pickle.frame(_columns(rows, target.parent.name, [name or _NO_WEATHER for name in weathers],
                                           has_voxels))
-    draft = target / f".{carla_runs.FRAME_FILE}.part"
+    draft = target / f".{muvo_runs.FRAME_FILE}.part"
     draft.write_bytes(content)
-    draft.replace(target / carla_runs.FRAME_FILE)
+    draft.replace(target / muvo_runs.FRAME_FILE)
 
 
 def _write_frame(frame: schema.RawFrame, recording: plain.PlainRecording, target: pathlib.Path, number: int) -> None:
@@ -153,13 +148,13 @@ def _write_frame(frame: schema.RawFrame, recording: plain.PlainRecording, target
     tags_of = _layout_tags(recording)
 
     def path(kind: str) -> pathlib.Path:
-        return target / carla_files.file_name(kind, number)
+        return target / muvo_files.file_name(kind, number)
 
     def save(kind: str, pixels: np.ndarray) -> None:
         Image.fromarray(np.ascontiguousarray(pixels)).save(path(kind), compress_level=1)
 
     save("image", frame["image"])
-    save("depth_semantic", np.concatenate([carla_files.encode_depth(frame["depth_m"]),
+    save("depth_semantic", np.concatenate([muvo_files.encode_depth(frame["depth_m"]),
                                            tags_of[frame["image_classes"]][..., None]], axis=-1))
     route = frame["route_map"]
     save("routemap", np.where(np.kron(route, np.ones((_LAYOUT_PX // route.shape[0],) * 2, np.uint8)) > 127, 255, 0)
@@ -169,7 +164,7 @@ def _write_frame(frame: schema.RawFrame, recording: plain.PlainRecording, target
                                                                                   np.uint8)
     path("points_semantic").write_bytes(frame_pickle.npy_of_dict(
         {"points_xyz": to_lidar_frame(frame["points_m"], described.lidar.position_m), "ObjTag": hit}))
-    if described.voxels == carla.VOXELS and "occupancy" in frame:
+    if described.voxels == muvo_reader.VOXELS and "occupancy" in frame:
         z, y, x = np.nonzero(frame["occupancy"].transpose(2, 1, 0) == 1)
         np.save(path("voxel"), np.stack([x, y, z, np.full(len(x), _OTHER_TAG)], axis=1).astype(np.uint16))
 
@@ -182,7 +177,7 @@ def _layout_tags(recording: plain.PlainRecording) -> np.ndarray:
     names = recording.stated_classes
     tags = np.arange(256, dtype=np.uint8)
     if names:
-        known = {name: tag for tag, name in enumerate(carla_files.CLASSES)}
+        known = {name: tag for tag, name in enumerate(muvo_files.CLASSES)}
         tags[:len(names)] = [known.get(name, _OTHER_TAG) for name in names]
     elif recording.description.name == "town":
         tags[:len(TOWN_TAGS)] = TOWN_TAGS
@@ -204,7 +199,7 @@ def _columns(rows: list[schema.RawFrame], town: str, weathers: list[str], has_vo
         return [np.full(size, value, dtype) for _ in range(count)]
 
     def paths(kind: str) -> list[str]:
-        return [carla_files.file_name(kind, number) for number in range(count)]
+        return [muvo_files.file_name(kind, number) for number in range(count)]
 
     def imu(row: schema.RawFrame) -> np.ndarray:
         reading = np.zeros(7, np.float32)
@@ -224,7 +219,7 @@ def _columns(rows: list[schema.RawFrame], town: str, weathers: list[str], has_vo
     }
     columns |= {f"{kind}_path": paths(kind) for kind in ("image", "depth_semantic", "birdview", "routemap",
                                                          "points_semantic")}
-    columns |= {"n_classes": np.full(count, len(carla_files.BIRDVIEW_BITS), np.int64),
+    columns |= {"n_classes": np.full(count, len(muvo_files.BIRDVIEW_BITS), np.int64),
                 "is_expert": np.ones(count, bool), "weather": weathers, "town": [town] * count,
                 "n_vehicles": [[0, 0]] * count, "n_walkers": [[0, 0]] * count, "route_id": np.zeros(count, np.int64),
                 "env_id": ["Endless-v0"] * count}

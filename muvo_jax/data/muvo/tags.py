@@ -13,13 +13,16 @@ from typing import Literal, NamedTuple, get_args
 
 import numpy as np
 
-from muvo_jax.data import carla_files, carla_runs, safe_pickle, schema
+from muvo_jax.data import schema
+from muvo_jax.data.muvo import files as muvo_files
+from muvo_jax.data.muvo import runs as muvo_runs
+from muvo_jax.data.muvo import safe_pickle
 
 TagSet = Literal["0.9.13", "0.9.14"]
 OLDER, NEWER = get_args(TagSet)
 # The most common tag of the ground: road line, road, sidewalk, ground, terrain; and the same in the newer numbers.
 _GROUND = {OLDER: (6, 7, 8, 14, 22), NEWER: (1, 2, 24, 25)}
-_OLDER_TAGS, _NEWER_TAGS = len(carla_files.CLASSES), 29
+_OLDER_TAGS, _NEWER_TAGS = len(muvo_files.CLASSES), 29
 _GROUND_SHARE, _GROUND_BAND_M = 0.5, 0.5
 # Where the two sets differ in what counts as occupied: the sky of either.
 _SKIES = (11, 13)
@@ -45,7 +48,7 @@ class FrameTags(NamedTuple):
     ground: list[np.ndarray]
 
 
-def of_frame(run: carla_runs.Run, row: int) -> FrameTags:
+def of_frame(run: muvo_runs.Run, row: int) -> FrameTags:
     """The tags that a frame's scan, voxels and picture hold, as far as they are there.
 
     Raises:
@@ -56,7 +59,7 @@ def of_frame(run: carla_runs.Run, row: int) -> FrameTags:
              if f"{kind}_path" in run.columns}
     paths = {kind: path for kind, path in paths.items() if path.is_file()}
     if "points_semantic" in paths:
-        scan = carla_files.read_points(paths["points_semantic"], (0.0, 0.0, 0.0))
+        scan = muvo_files.read_points(paths["points_semantic"], (0.0, 0.0, 0.0))
         if scan.tags is not None and len(scan.tags):
             found.every.append(scan.tags)
             height_m = scan.points_m[:, 2]
@@ -66,7 +69,7 @@ def of_frame(run: carla_runs.Run, row: int) -> FrameTags:
         if isinstance(rows, np.ndarray) and rows.ndim == 2 and rows.shape[1] == 4 and len(rows):
             found.every.append(rows[:, 3])
     if "depth_semantic" in paths:
-        _, tags = carla_files.read_depth_semantic(paths["depth_semantic"])
+        _, tags = muvo_files.read_depth_semantic(paths["depth_semantic"])
         found.every.append(tags)
         found.ground.append(tags[-max(len(tags) // 8, 1):])
     return found
@@ -85,7 +88,7 @@ def recognise(every: Iterable[np.ndarray], ground: Iterable[np.ndarray], where: 
     """
     counts, below = (sum((np.bincount(np.minimum(tags, 255).astype(np.uint8).ravel(), minlength=256) for tags in parts),
                          np.zeros(256, np.int64)) for parts in (every, ground))
-    known = np.flatnonzero(counts[:carla_files.UNKNOWN_TAG])
+    known = np.flatnonzero(counts[:muvo_files.UNKNOWN_TAG])
     if known.size and known[-1] >= _NEWER_TAGS:
         raise schema.DataError(f"{where}: tag {known[-1]} is none of CARLA's up to 0.9.16; they end with "
                                f"{_NEWER_TAGS - 1}.")
@@ -113,8 +116,8 @@ def to_layout(tags: np.ndarray, tag_set: TagSet | None, path: pathlib.Path) -> n
       DataError: where that would be a guess.
     """
     if tag_set == NEWER:
-        return np.where(tags < _NEWER_TAGS, carla_files.LAYOUT_TAGS[np.minimum(tags, 255)], carla_files.UNKNOWN_TAG
+        return np.where(tags < _NEWER_TAGS, muvo_files.LAYOUT_TAGS[np.minimum(tags, 255)], muvo_files.UNKNOWN_TAG
                         ).astype(np.uint8)
     if tag_set is None and np.isin(tags, _SKIES).any():
         raise undecided(str(path))
-    return carla_files.known_classes(tags)
+    return muvo_files.known_classes(tags)

@@ -1,4 +1,4 @@
-"""The runs of a folder in the MUVO / MILE CARLA layout (carla.py), and the table of frames that each of them has."""
+"""The runs of a folder in the MUVO / MILE CARLA layout (reader.py), and the table of frames that each of them has."""
 
 from __future__ import annotations
 
@@ -11,7 +11,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from muvo_jax.data import files, safe_pickle, schema
+from muvo_jax.data import files, schema
+from muvo_jax.data.muvo import safe_pickle
 
 FRAME_FILE = "pd_dataframe.pkl"
 VERSION_FOLDER = "trainval"

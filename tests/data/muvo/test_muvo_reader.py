@@ -7,7 +7,10 @@ import pytest
 import recording_samples as samples
 
 from muvo_jax import presets
-from muvo_jax.data import carla, carla_files, carla_runs, prepare, schema, sources
+from muvo_jax.data import prepare, schema, sources
+from muvo_jax.data.muvo import files as muvo_files
+from muvo_jax.data.muvo import reader as muvo_reader
+from muvo_jax.data.muvo import runs as muvo_runs
 
 pytestmark = pytest.mark.skipif(samples.MUVO_LAYOUT is None,
                                 reason="no recording in the MUVO layout here; name one by MUVO_LAYOUT=FOLDER")
@@ -41,13 +44,13 @@ def test_every_level_of_the_tree_is_recognised():
 
 
 def test_runs_of_little_reward_and_the_first_second_are_left_out():
-    recording = carla.CarlaRecording(samples.MUVO_LAYOUT)
-    every = carla_runs.find_runs(samples.MUVO_LAYOUT)
+    recording = muvo_reader.MuvoRecording(samples.MUVO_LAYOUT)
+    every = muvo_runs.find_runs(samples.MUVO_LAYOUT)
     low = {run.name for run in every if run.mean_reward < 0.6}
     assert low.isdisjoint(sequence.name for sequence in recording.sequences)
     assert any(f"{len(low)} of {len(every)} runs are left out" in note for note in recording.description.notes)
     assert {sequence.start for sequence in recording.sequences} == {10}
-    everything = carla.CarlaRecording(samples.MUVO_LAYOUT, min_mean_reward=-np.inf, skipped_s=0.0)
+    everything = muvo_reader.MuvoRecording(samples.MUVO_LAYOUT, min_mean_reward=-np.inf, skipped_s=0.0)
     assert sum(sequence.length for sequence in everything.sequences) == sum(run.frames for run in every)
 
 
@@ -65,7 +68,7 @@ def test_a_frame(run_folder):
     assert frame["image"].shape == (camera.height_px, camera.width_px, 3)
     # Field of view 110 degrees: half the width over the tangent of 55 degrees.
     assert frame["intrinsics"][0, 0] == pytest.approx(camera.width_px / 2 / np.tan(np.radians(55)), rel=1e-6)
-    assert not carla_files.in_ego_box(frame["points_m"]).any()
+    assert not muvo_files.in_ego_box(frame["points_m"]).any()
     assert set(np.unique(frame["occupancy"])) == {0, 1} and frame["occupancy"].shape == (192, 192, 64)
     assert frame["route_map"].shape == (64, 64) and set(np.unique(frame["route_map"])) == {0, 255}
 
@@ -89,8 +92,8 @@ def test_other_sensors_are_described_beside_the_data(layout):
     assert recording.description.rate_hz == 20 and recording.description.contract.rate_hz == 20
     frame = recording.read(recording.sequences[0], 0)
     assert "occupancy" not in frame and recording.sequences[0].start == 20
-    path = layout / "trainval/train/Town01/0000" / carla_files.file_name("points_semantic", 20)
-    default = carla_files.read_points(path, (1.0, 0.0, 2.0)).points_m
+    path = layout / "trainval/train/Town01/0000" / muvo_files.file_name("points_semantic", 20)
+    default = muvo_files.read_points(path, (1.0, 0.0, 2.0)).points_m
     # The lidar sits 1 m further back, 0.5 m to the left and 0.2 m lower; boxes differ, so compare far points.
     ours = frame["points_m"]
     assert np.isclose(ours[:, 0].max(), default[:, 0].max() - 1.0) and np.isclose(ours[:, 1].max(),
@@ -115,7 +118,7 @@ def test_a_run_without_data_frame_is_counted(layout):
 
 
 def test_paths_out_of_the_run_are_refused(layout, run_folder):
-    path = run_folder / carla_runs.FRAME_FILE
+    path = run_folder / muvo_runs.FRAME_FILE
     path.write_bytes(path.read_bytes().replace(b"image/image_000000007.png", b"../../../../../etc/passwd"))
     with pytest.raises(schema.DataError, match=r"row 7: image_path is .*inside the run"):
         sources.open_recording(layout)
@@ -141,10 +144,10 @@ def test_damaged_frames(run_folder, damage, message):
 
 def test_tags_of_newer_simulators_are_occupied():
     tags = np.array([0, 13, 1, 22, 28, 255])
-    assert carla_files.is_occupied(tags).tolist() == [False, False, True, True, True, False]
+    assert muvo_files.is_occupied(tags).tolist() == [False, False, True, True, True, False]
 
 
 def test_depth_goes_there_and_back():
     depth_m = np.array([[0.0, 0.5, 73.21, 999.99, np.inf]])
-    back_m = 1000 * carla_files.decode_depth(carla_files.encode_depth(depth_m))
+    back_m = 1000 * muvo_files.decode_depth(muvo_files.encode_depth(depth_m))
     np.testing.assert_allclose(back_m, [[0.0, 0.5, 73.21, 999.99, 1000.0]], atol=1e-4)

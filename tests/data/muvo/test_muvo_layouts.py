@@ -8,20 +8,13 @@ import pytest
 from PIL import Image
 
 from muvo_jax import config as config_lib
-from muvo_jax.data import (
-    carla,
-    carla_files,
-    carla_recorder,
-    carla_runs,
-    carla_tags,
-    frame_pickle,
-    muvo_export,
-    plain,
-    recorder,
-    schema,
-    shards,
-    sources,
-)
+from muvo_jax.data import carla_recorder, plain, recorder, schema, shards, sources
+from muvo_jax.data.muvo import exporter as muvo_exporter
+from muvo_jax.data.muvo import files as muvo_files
+from muvo_jax.data.muvo import frame_pickle
+from muvo_jax.data.muvo import reader as muvo_reader
+from muvo_jax.data.muvo import runs as muvo_runs
+from muvo_jax.data.muvo import tags as muvo_tags
 
 FRAMES = 24
 # What lies where, in the tags of CARLA up to 0.9.13 and from 0.9.14 on.
@@ -49,7 +42,7 @@ def write_run(folder, *, numbers=range(FRAMES), tags=None, suffix=".png", table_
              **({"routemap": ".png"} if "routemap" in kinds else {})}
     columns |= {f"{kind}_path": [f"{kind}{separator}{kind}_{number:09d}{ending}" for number in rows]
                 for kind, ending in names.items()}
-    (folder / carla_runs.FRAME_FILE).write_bytes(frame_pickle.frame(columns))
+    (folder / muvo_runs.FRAME_FILE).write_bytes(frame_pickle.frame(columns))
     return folder
 
 
@@ -145,7 +138,7 @@ def test_sensors_that_cannot_be_are_refused(tmp_path, text, message):
 def test_tags_are_recognised_by_what_they_are_and_where(tmp_path, tags):
     recording = sources.open_recording(layout(tmp_path, tags=tags), labels={"point_classes"})
     classes = recording.read(recording.sequences[0], 0)["point_classes"]
-    names = [carla_files.CLASSES[index] for index in classes]
+    names = [muvo_files.CLASSES[index] for index in classes]
     line = "road line" if tags["line"] != 1 else "road"
     assert names == ["road"] * 100 + ["vehicle"] * 50 + ["pedestrian"] * 50 + [line] * 4
 
@@ -157,21 +150,21 @@ def test_tags_that_do_not_tell_are_not_guessed(tmp_path):
     sources.open_recording(root)  # nobody asks for classes
     (root / "sensors.toml").write_text("tags = \"0.9.14\"\n")
     recording = sources.open_recording(root, labels={"point_classes"})
-    assert set(recording.read(recording.sequences[0], 0)["point_classes"]) == {carla_files.LAYOUT_TAGS[3]}
+    assert set(recording.read(recording.sequences[0], 0)["point_classes"]) == {muvo_files.LAYOUT_TAGS[3]}
     with pytest.raises(schema.DataError, match="tag 77 is none of CARLA's"):
         sources.open_recording(layout(tmp_path / "wild", tags=OLDER | {"car": 77}), labels={"point_classes"})
 
 
 def test_sky_and_what_is_occupied_follow_the_tag_set(tmp_path):
     file = tmp_path / "voxel.npy"
-    for tag_set, tags in ((carla_tags.OLDER, OLDER), (carla_tags.NEWER, NEWER)):
+    for tag_set, tags in ((muvo_tags.OLDER, OLDER), (muvo_tags.NEWER, NEWER)):
         rows = np.array([[index, 0, 0, tag] for index, tag in enumerate(tags.values())], np.uint16)
         np.save(file, rows)
-        occupied = carla_files.read_voxels(file, carla.VOXELS, lambda found, path, chosen=tag_set: carla_tags.to_layout(
-            found, chosen, path))
+        occupied = muvo_files.read_voxels(file, muvo_reader.VOXELS,
+                                          lambda found, path, chosen=tag_set: muvo_tags.to_layout(found, chosen, path))
         assert occupied[:5, 0, 0].tolist() == [1, 1, 1, 0, 1]
     with pytest.raises(schema.DataError, match="may be those of"):
-        carla_tags.to_layout(np.array([11]), None, file)
+        muvo_tags.to_layout(np.array([11]), None, file)
 
 
 def test_one_run_with_more_files_takes_no_run_away(tmp_path):
@@ -187,7 +180,7 @@ def test_one_run_with_more_files_takes_no_run_away(tmp_path):
 
 
 @pytest.mark.parametrize(("text", "expected"), [
-    ("", carla.ROUTE_MAP),
+    ("", muvo_reader.ROUTE_MAP),
     ("[route_map]\nmetres_per_px = 0.25\nego_row = 40\nego_column = 30\n", config_lib.RouteMap(0.25, 40.0, 30.0))])
 def test_a_pack_keeps_the_scale_of_the_route_maps(tmp_path, text, expected):
     root = layout(tmp_path / "rec", kinds=("image", "routemap"))
@@ -204,8 +197,8 @@ def test_an_export_says_the_weather_and_the_town_of_each_run(tmp_path):
     source = tmp_path / "source"
     camera = schema.Camera.level(64, 32, 1.5, (1.0, 0.0, 2.0))
     recorder.write_description(source, name="CARLA", rate_hz=10, splits=("train", "val_rl"), camera=camera,
-                               lidar=carla.LIDAR, contract=carla.CONTRACT, classes=carla_files.CLASSES,
-                               route_map=carla.ROUTE_MAP)
+                               lidar=muvo_reader.LIDAR, contract=muvo_reader.CONTRACT, classes=muvo_files.CLASSES,
+                               route_map=muvo_reader.ROUTE_MAP)
     weathers = {"Town03_000": "WetNoon", "Town06_001": "ClearSunset", "mine": ""}
     for run, weather in weathers.items():
         writer = recorder.RunWriter(source, "train", run)
@@ -216,12 +209,12 @@ def test_an_export_says_the_weather_and_the_town_of_each_run(tmp_path):
                           "points_m": np.ones((4, 3)), "point_tags": np.full(4, 4, np.uint8),
                           "route_map": np.zeros((64, 64), np.uint8)})
         writer.close()
-    muvo_export.export(source, tmp_path / "out", town="Town05")
-    runs = {run.folder.parent.name: run for run in carla_runs.find_runs(tmp_path / "out")}
+    muvo_exporter.export(source, tmp_path / "out", town="Town05")
+    runs = {run.folder.parent.name: run for run in muvo_runs.find_runs(tmp_path / "out")}
     assert {town: set(run.columns["weather"]) for town, run in runs.items()} == {
         "Town03": {"WetNoon"}, "Town06": {"ClearSunset"}, "Town05": {"ClearNoon"}}
     assert {town: set(run.columns["town"]) for town, run in runs.items()} == {town: {town} for town in runs}
-    recording = carla.CarlaRecording(tmp_path / "out", skipped_s=0.0, labels=frozenset(
+    recording = muvo_reader.MuvoRecording(tmp_path / "out", skipped_s=0.0, labels=frozenset(
         {"image_classes", "image_instance_mask", "point_classes"}))
     frame = recording.read(recording.sequences[0], 0)
     assert frame["image_instance_mask"].all() and (frame["point_classes"] == 4).all()
@@ -230,6 +223,6 @@ def test_an_export_says_the_weather_and_the_town_of_each_run(tmp_path):
 def test_drives_recorded_in_carla_name_their_classes_and_scale(tmp_path):
     carla_recorder._describe(tmp_path, carla_recorder.Settings())
     header = plain.read_header(tmp_path)
-    assert tuple(header["classes"]) == carla_files.CLASSES
-    assert config_lib.parse(config_lib.RouteMap, header["route_map"], "route_map") == carla.ROUTE_MAP
+    assert tuple(header["classes"]) == muvo_files.CLASSES
+    assert config_lib.parse(config_lib.RouteMap, header["route_map"], "route_map") == muvo_reader.ROUTE_MAP
     assert "vehicle" in header["classes"] and "pedestrian" in header["classes"]

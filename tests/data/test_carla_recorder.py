@@ -11,16 +11,11 @@ import numpy as np
 import pytest
 
 from muvo_jax import command_line, record_carla
-from muvo_jax.data import (
-    carla_client,
-    carla_drives,
-    carla_frames,
-    carla_recorder,
-    plain,
-    processes,
-    recorder,
-    voxelizing,
-)
+from muvo_jax.data import plain, processes, recorder, voxelizing
+from muvo_jax.data.carla import client as carla_client
+from muvo_jax.data.carla import drives as carla_drives
+from muvo_jax.data.carla import frames as carla_frames
+from muvo_jax.data.carla import recorder as carla_recorder
 from muvo_jax.data.muvo import files as muvo_files
 
 SETTINGS = carla_drives.Settings(width_px=24, height_px=16, points_per_frame=50)

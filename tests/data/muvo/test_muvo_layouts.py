@@ -8,7 +8,8 @@ import pytest
 from PIL import Image
 
 from muvo_jax import config as config_lib
-from muvo_jax.data import carla_recorder, plain, recorder, schema, shards, sources
+from muvo_jax.data import plain, recorder, schema, shards, sources
+from muvo_jax.data.carla import recorder as carla_recorder
 from muvo_jax.data.muvo import exporter as muvo_exporter
 from muvo_jax.data.muvo import files as muvo_files
 from muvo_jax.data.muvo import frame_pickle

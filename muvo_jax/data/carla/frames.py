@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from PIL import Image, ImageDraw
 
-from muvo_jax.data.carla_drives import CarlaError, Settings
+from muvo_jax.data.carla.drives import CarlaError, Settings
 from muvo_jax.data.muvo import files as muvo_files
 
 CAMERAS = ("image", "depth", "classes")

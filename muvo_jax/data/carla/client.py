@@ -11,7 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from muvo_jax.data import carla_drives, carla_frames
+from muvo_jax.data.carla import drives as carla_drives
+from muvo_jax.data.carla import frames as carla_frames
 
 EGO_BLUEPRINT = "vehicle.lincoln.mkz_2017"  # muvo.files.EGO_BOX_M is its size
 WARM_UP_TICKS = 20  # the car settles, sensors start

@@ -1,6 +1,6 @@
 """Records drives in CARLA in the plain format: the loop, health checks, resuming. Nothing here imports carla.
 
-A `Simulator` (carla_client.py, or a test's) hands over the client's own measurements; carla_frames.py decodes them.
+A `Simulator` (client.py, or a test's) hands over the client's own measurements; frames.py decodes them.
 """
 
 from __future__ import annotations
@@ -15,9 +15,10 @@ from typing import Protocol
 
 import numpy as np
 
-from muvo_jax.data import carla_frames, processes, recorder, schema
-from muvo_jax.data.carla_drives import SPLITS, BadDriveError, CarlaDrive, CarlaError, Settings, estimate
-from muvo_jax.data.carla_frames import SENSORS, Tick
+from muvo_jax.data import processes, recorder, schema
+from muvo_jax.data.carla import frames as carla_frames
+from muvo_jax.data.carla.drives import SPLITS, BadDriveError, CarlaDrive, CarlaError, Settings, estimate
+from muvo_jax.data.carla.frames import SENSORS, Tick
 from muvo_jax.data.muvo import files as muvo_files
 from muvo_jax.data.muvo import reader as muvo_reader
 

@@ -16,7 +16,6 @@ import pathlib
 import resource
 import tempfile
 import time
-import types
 from collections.abc import Callable
 
 import data_baselines
@@ -25,7 +24,9 @@ from PIL import Image
 
 from muvo_jax import config as config_lib
 from muvo_jax import presets
-from muvo_jax.data import pipeline, prepare, recorder, records, schema, shards, sources
+from muvo_jax.data import pipeline, prepare, recorder, schema, sources
+from muvo_jax.data.packed import manifest, records
+from muvo_jax.data.packed import writer as packed_writer
 from muvo_jax.interop.weights_rule import make_input
 from muvo_jax.ops import camera, range_view, voxels
 
@@ -90,8 +91,9 @@ def packing(recording: schema.Recording) -> list[str]:
         lines.append(f"| {name}{', points in half' * encoding.half_points} | {sum(map(len, packed)) / count / 1e3:.1f} "
                      f"| {'exact' if math.isinf(quality) else f'{quality:.1f}'} | {off_m:.3f} |")
     with tempfile.TemporaryDirectory() as folder:
-        write_s = seconds(lambda: list(shards.write_shards(recording, pathlib.Path(folder), [0], count,
-                                                           records.Encoding())), 2)
+        shard = packed_writer.Shard(0, ((sequence, 0, count),), "")
+        write_s = seconds(lambda: list(packed_writer.write_shard(recording, pathlib.Path(folder), records.Encoding(),
+                                                                 shard)), 2)
     reading_s = seconds(lambda: [recording.read(sequence, index) for index in range(count)], 2)
     encoded = [records.encode_frame(frame, records.Encoding()) for frame in raw]
     decode_s = seconds(lambda: [records.decode_frame(record, "here") for record in encoded], 2)
@@ -100,19 +102,21 @@ def packing(recording: schema.Recording) -> list[str]:
 
 
 def peak_mib(folder: pathlib.Path, frames: int) -> float:
-    """Peak memory of a process of its own that packs so many frames (the recording again and again)."""
+    """Peak memory of a process of its own that packs so many frames (those of one sequence again and again)."""
     recording = sources.open_recording(folder)
-    length = sum(sequence.length for sequence in recording.sequences)
-    longer = types.SimpleNamespace(sequences=recording.sequences * math.ceil(frames / length), read=recording.read)
+    sequence, per_shard = recording.sequences[0], manifest.FRAMES_PER_SHARD
+    count = min(sequence.length, per_shard)
+    parts = ((sequence, 0, count),) * math.ceil(per_shard / count)
     with tempfile.TemporaryDirectory() as out:
-        numbers = list(range(frames // shards.FRAMES_PER_SHARD))
-        for _ in shards.write_shards(longer, pathlib.Path(out), numbers, shards.FRAMES_PER_SHARD, records.Encoding()):
-            pass
+        for number in range(frames // per_shard):
+            for _ in packed_writer.write_shard(recording, pathlib.Path(out), records.Encoding(),
+                                               packed_writer.Shard(number, parts, "")):
+                pass
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
 
 
 def packing_memory(folder: pathlib.Path) -> str:
-    lengths = (2 * shards.FRAMES_PER_SHARD, 10 * shards.FRAMES_PER_SHARD)
+    lengths = (2 * manifest.FRAMES_PER_SHARD, 10 * manifest.FRAMES_PER_SHARD)
     with multiprocessing.get_context("spawn").Pool(1, maxtasksperchild=1) as pool:
         peaks = [pool.apply(peak_mib, (folder, frames)) for frames in lengths]
     return "Peak memory of packing: " + ", ".join(f"{peak:.0f} MiB for {frames} frames" for peak, frames in

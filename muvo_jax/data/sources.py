@@ -6,9 +6,11 @@ import pathlib
 from collections.abc import Callable, Collection
 from typing import Any, NamedTuple
 
-from muvo_jax.data import files, kitti, manifest, plain, records, schema
+from muvo_jax.data import files, kitti, plain, schema
 from muvo_jax.data.muvo import reader as muvo_reader
 from muvo_jax.data.muvo import runs as muvo_runs
+from muvo_jax.data.packed import manifest
+from muvo_jax.data.packed import reader as packed_reader
 
 
 class Kind(NamedTuple):
@@ -33,7 +35,7 @@ class Kind(NamedTuple):
 
 KINDS = (
     Kind("packed", f"a folder of shards with {manifest.MANIFEST_FILE}",
-         lambda path: (path / manifest.MANIFEST_FILE).is_file(), records.PackedRecording,
+         lambda path: (path / manifest.MANIFEST_FILE).is_file(), packed_reader.PackedRecording,
          options=("labels", "corrupt")),
     Kind("plain", f"a folder with {plain.DESCRIPTION_FILE}",
          lambda path: (path / plain.DESCRIPTION_FILE).is_file(), plain.PlainRecording),
@@ -86,7 +88,7 @@ def open_recording(path: pathlib.Path | str, *, camera: str = "", skip_corrupt_s
 
     Args:
       camera: which one, where the format records several; by default the reader's choice.
-      skip_corrupt_shards: of a packed recording; see records.PackedRecording.
+      skip_corrupt_shards: of a packed recording; see packed_reader.PackedRecording.
       labels: which of schema.LABELS the frames should have, where the recording holds them.
 
     Raises:

@@ -11,7 +11,10 @@ from hypothesis.extra import numpy as arrays
 
 from muvo_jax import config as config_lib
 from muvo_jax import types
-from muvo_jax.data import fields, kitti, plain, recorder, records, schema, shards
+from muvo_jax.data import fields, kitti, plain, recorder, schema
+from muvo_jax.data.packed import reader as packed_reader
+from muvo_jax.data.packed import records
+from muvo_jax.data.packed import writer as packed_writer
 
 SIZES = {"H": 6, "W": 9, "N": 7, "X": 4, "Y": 5, "Z": 3}
 CLASSES = (*(f"class {number}" for number in range(20)), "vehicle")
@@ -114,8 +117,8 @@ def test_a_run_may_have_one_of_the_masks_that_share_a_file(tmp_path):
 
 def test_kitti_and_packs_are_copied_bit_for_bit(tmp_path):
     sources_ = {"kitti": kitti.KittiRecording(writers.write_kitti(tmp_path / "kitti"))}
-    shards.pack(writers.write_plain(tmp_path / "plain"), tmp_path / "packed", workers=1)
-    sources_["packed"] = records.PackedRecording(tmp_path / "packed")
+    packed_writer.pack(writers.write_plain(tmp_path / "plain"), tmp_path / "packed", workers=1)
+    sources_["packed"] = packed_reader.PackedRecording(tmp_path / "packed")
     for name, source in sources_.items():
         sequence = source.sequences[0]
         written = [source.read(sequence, index) for index in range(sequence.length)]

@@ -8,7 +8,7 @@ import pytest
 from PIL import Image
 
 from muvo_jax import config as config_lib
-from muvo_jax.data import plain, recorder, schema, shards, sources
+from muvo_jax.data import plain, recorder, schema, sources
 from muvo_jax.data.carla import recorder as carla_recorder
 from muvo_jax.data.muvo import exporter as muvo_exporter
 from muvo_jax.data.muvo import files as muvo_files
@@ -16,6 +16,7 @@ from muvo_jax.data.muvo import frame_pickle
 from muvo_jax.data.muvo import reader as muvo_reader
 from muvo_jax.data.muvo import runs as muvo_runs
 from muvo_jax.data.muvo import tags as muvo_tags
+from muvo_jax.data.packed import writer as packed_writer
 
 FRAMES = 24
 # What lies where, in the tags of CARLA up to 0.9.13 and from 0.9.14 on.
@@ -186,7 +187,7 @@ def test_one_run_with_more_files_takes_no_run_away(tmp_path):
 def test_a_pack_keeps_the_scale_of_the_route_maps(tmp_path, text, expected):
     root = layout(tmp_path / "rec", kinds=("image", "routemap"))
     (root / "sensors.toml").write_text(text)
-    assert shards.pack(root, tmp_path / "out", workers=1)
+    assert packed_writer.pack(root, tmp_path / "out", workers=1)
     source, packed = sources.open_recording(root), sources.open_recording(tmp_path / "out")
     assert packed.description == dataclasses.replace(source.description, kind="packed MUVO CARLA")
     assert packed.description.route_map == expected and packed.sequences == source.sequences

@@ -21,9 +21,12 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from PIL import Image
 
-from muvo_jax.data import plain, records, schema, shards, sources
+from muvo_jax.data import plain, schema, sources
+from muvo_jax.data.packed import reader as packed_reader
+from muvo_jax.data.packed import records
+from muvo_jax.data.packed import writer as packed_writer
 
-ROOT = pathlib.Path(__file__).parents[2]
+ROOT = pathlib.Path(__file__).parents[3]
 
 
 def frames_of(recording):
@@ -45,13 +48,13 @@ def source(tmp_path_factory):
 @pytest.fixture
 def packed(source, tmp_path):
     out = tmp_path / "gepackt ü"
-    assert shards.pack(source, out, frames_per_shard=5, workers=1)
+    assert packed_writer.pack(source, out, frames_per_shard=5, workers=1)
     return out
 
 
 def test_every_frame_and_the_description_come_back(source, packed):
     before, after = plain.PlainRecording(source), sources.open_recording(packed)
-    assert isinstance(after, records.PackedRecording)
+    assert isinstance(after, packed_reader.PackedRecording)
     assert after.sequences == before.sequences
     for name in ("camera", "lidar", "voxels", "contract", "modalities", "splits", "rate_hz", "name"):
         assert getattr(after.description, name) == getattr(before.description, name)
@@ -62,37 +65,37 @@ def test_every_frame_and_the_description_come_back(source, packed):
 
 
 def test_machines_share_the_shards(source, packed, tmp_path):
-    assert not shards.pack(source, tmp_path / "two", frames_per_shard=5, machine=1, machines=2, workers=1)
+    assert not packed_writer.pack(source, tmp_path / "two", frames_per_shard=5, machine=1, machines=2, workers=1)
     with pytest.raises(schema.DataError, match="manifest"):
-        records.PackedRecording(tmp_path / "two")
-    assert shards.pack(source, tmp_path / "two", frames_per_shard=5, machine=0, machines=2, workers=1)
+        packed_reader.PackedRecording(tmp_path / "two")
+    assert packed_writer.pack(source, tmp_path / "two", frames_per_shard=5, machine=0, machines=2, workers=1)
     assert (tmp_path / "two/manifest.json").read_text() == (packed / "manifest.json").read_text()
 
 
 def test_a_killed_packer_loses_only_the_shard_it_was_writing(source, packed, tmp_path):
     out = tmp_path / "killed"
-    code = ("import time, sys\nfrom muvo_jax.data import shards, records\n"
+    code = ("import time, sys\nfrom muvo_jax.data.packed import records, writer\n"
             "encode = records.encode_frame\n"
             "def slow(*arguments):\n    time.sleep(0.05)\n    return encode(*arguments)\n"
             "records.encode_frame = slow\n"
-            f"shards.pack({str(source)!r}, {str(out)!r}, frames_per_shard=5, workers=1)\n")
+            f"writer.pack({str(source)!r}, {str(out)!r}, frames_per_shard=5, workers=1)\n")
     process = subprocess.Popen([sys.executable, "-c", code], cwd=ROOT, env=os.environ | {"PYTHONPATH": str(ROOT)})
     while not (out / "shard-00001.json").exists() and process.poll() is None:
         time.sleep(0.01)
     with pytest.raises(BlockingIOError, match="another process is packing"):
-        shards.pack(source, out, frames_per_shard=5, workers=1)
+        packed_writer.pack(source, out, frames_per_shard=5, workers=1)
     process.send_signal(signal.SIGKILL)
     assert process.wait() == -signal.SIGKILL
     assert not (out / "manifest.json").exists()
     kept = (out / "shard-00000.arrayrecord").stat().st_mtime_ns
-    assert shards.pack(source, out, frames_per_shard=5, workers=1)
+    assert packed_writer.pack(source, out, frames_per_shard=5, workers=1)
     assert (out / "shard-00000.arrayrecord").stat().st_mtime_ns == kept
     assert json.loads((out / "manifest.json").read_text()) == json.loads((packed / "manifest.json").read_text())
 
 
 def test_other_settings_do_not_mix(source, packed):
     with pytest.raises(FileExistsError, match="other settings"):
-        shards.pack(source, packed, frames_per_shard=6, workers=1)
+        packed_writer.pack(source, packed, frames_per_shard=6, workers=1)
 
 
 def test_a_truncated_shard_is_named_and_counted(packed):
@@ -134,9 +137,9 @@ def test_records_are_not_unpickled_and_lossy_ones_are_smaller(source):
 
 def test_more_shards_than_a_process_may_open(source, tmp_path):
     out = tmp_path / "many"
-    assert shards.pack(source, out, frames_per_shard=1, workers=1)
-    code = ("import resource, sys\nfrom muvo_jax.data import records\n"
-            "records._OPEN_READERS = 4\nrecording = records.PackedRecording(sys.argv[1])\n"
+    assert packed_writer.pack(source, out, frames_per_shard=1, workers=1)
+    code = ("import resource, sys\nfrom muvo_jax.data.packed import reader\n"
+            "reader._OPEN_READERS = 4\nrecording = reader.PackedRecording(sys.argv[1])\n"
             "resource.setrlimit(resource.RLIMIT_NOFILE, (16, 16))\n"
             "for _ in range(2):\n    for sequence in recording.sequences:\n"
             "        for index in range(sequence.length):\n            recording.read(sequence, index)\n")
@@ -146,9 +149,9 @@ def test_more_shards_than_a_process_may_open(source, tmp_path):
 
 
 def test_readers_are_bounded_and_closed(source, tmp_path, monkeypatch):
-    assert shards.pack(source, tmp_path / "out", frames_per_shard=1, workers=1)
-    monkeypatch.setattr(records, "_OPEN_READERS", 3)
-    recording = records.PackedRecording(tmp_path / "out")
+    assert packed_writer.pack(source, tmp_path / "out", frames_per_shard=1, workers=1)
+    monkeypatch.setattr(packed_reader, "_OPEN_READERS", 3)
+    recording = packed_reader.PackedRecording(tmp_path / "out")
     before = len(os.listdir("/proc/self/fd"))
     first = frames_of(recording)
     assert len(os.listdir("/proc/self/fd")) - before <= 3
@@ -160,7 +163,7 @@ def test_readers_are_bounded_and_closed(source, tmp_path, monkeypatch):
 
 def test_several_workers_write_what_one_writes(source, packed, tmp_path):
     progress = []
-    assert shards.pack(source, tmp_path / "two", frames_per_shard=5, workers=2,
+    assert packed_writer.pack(source, tmp_path / "two", frames_per_shard=5, workers=2,
                        progress=lambda *counts: progress.append(counts))
     assert (tmp_path / "two/manifest.json").read_text() == (packed / "manifest.json").read_text()
     assert progress[-1] == (24, 24)
@@ -171,44 +174,44 @@ def test_an_error_is_the_same_from_one_worker_and_from_several(source, tmp_path,
     broken = shutil.copytree(source, tmp_path / "broken")
     (broken / "train/b/lidar/000003.npz").write_bytes(b"nothing")
     with pytest.raises(schema.DataError, match=r"000003.npz: not a readable NPZ file"):
-        shards.pack(broken, tmp_path / "out", frames_per_shard=5, workers=workers)
+        packed_writer.pack(broken, tmp_path / "out", frames_per_shard=5, workers=workers)
     assert not (tmp_path / "out/manifest.json").exists()
 
 
 def test_a_corrected_source_packs_anew_what_it_touches(source, tmp_path):
     recording, out = shutil.copytree(source, tmp_path / "copy"), tmp_path / "out"
-    assert shards.pack(recording, out, frames_per_shard=4, workers=1)
+    assert packed_writer.pack(recording, out, frames_per_shard=4, workers=1)
     times = {path.name: path.stat().st_mtime_ns for path in out.glob("*.arrayrecord")}
     corrected = np.full((16, 16, 16), 1, np.uint8)
     np.savez(recording / "train/b/occupancy/000002.npz", occupancy=corrected)
-    assert shards.pack(recording, out, frames_per_shard=4, workers=1)
+    assert packed_writer.pack(recording, out, frames_per_shard=4, workers=1)
     changed = {name for name, time_ns in times.items() if (out / name).stat().st_mtime_ns != time_ns}
     # Run a has 10 frames, b the next 6: shards of 4 that hold some of b are 2 and 3.
     assert changed == {"shard-00002.arrayrecord", "shard-00003.arrayrecord"}
-    assert any(np.array_equal(frame["occupancy"], corrected) for frame in frames_of(records.PackedRecording(out)))
+    assert any(np.array_equal(frame["occupancy"], corrected) for frame in frames_of(packed_reader.PackedRecording(out)))
     (recording / "val_rl/c/image/000007.png").unlink()  # one frame less: the last shard is shorter
     with pytest.warns(schema.DataWarning):
-        assert shards.pack(recording, out, frames_per_shard=4, workers=1)
-    assert len(frames_of(records.PackedRecording(out))) == 23
+        assert packed_writer.pack(recording, out, frames_per_shard=4, workers=1)
+    assert len(frames_of(packed_reader.PackedRecording(out))) == 23
 
 
 @pytest.mark.parametrize("place", [".", "inside", ".."])
 def test_source_and_target_lie_apart(source, tmp_path, place):
     recording = shutil.copytree(source, tmp_path / "there/copy")
     with pytest.raises(ValueError, match="lie in one another"):
-        shards.pack(recording, recording / place, workers=1)
+        packed_writer.pack(recording, recording / place, workers=1)
 
 
 def test_the_camera_is_chosen(tmp_path):
     drive = writers.write_kitti(tmp_path)
     shutil.copytree(drive / "image_02", drive / "image_00")
     calibration = drive.parent / "calib_cam_to_cam.txt"
-    assert shards.pack(drive, tmp_path / "out", camera="image_00", workers=1)
+    assert packed_writer.pack(drive, tmp_path / "out", camera="image_00", workers=1)
     assert calibration.is_file()
     left, right = sources.open_recording(drive, camera="image_00"), sources.open_recording(tmp_path / "out")
     assert left.description.camera == right.description.camera
     with pytest.raises(FileExistsError, match="other settings"):
-        shards.pack(drive, tmp_path / "out", camera="image_02", workers=1)
+        packed_writer.pack(drive, tmp_path / "out", camera="image_02", workers=1)
 
 
 def test_labels_are_packed_and_left_out_where_nobody_asks(source, tmp_path):
@@ -217,13 +220,13 @@ def test_labels_are_packed_and_left_out_where_nobody_asks(source, tmp_path):
         folder = image.parents[1] / "depth"
         folder.mkdir(exist_ok=True)
         Image.fromarray(np.full((32, 64), 500, np.uint16)).save(folder / image.name)
-    assert shards.pack(recording, tmp_path / "out", workers=1)
+    assert packed_writer.pack(recording, tmp_path / "out", workers=1)
     with_labels = sources.open_recording(tmp_path / "out", labels=schema.LABELS)
     expected = sources.open_recording(recording, labels=schema.LABELS)
     assert with_labels.description.modalities == expected.description.modalities >= {"depth_m"}
     for left, right in zip(frames_of(expected), frames_of(with_labels), strict=True):
         assert_same(left, right)
-    assert shards.pack(recording, tmp_path / "without", labels=False, workers=1)
+    assert packed_writer.pack(recording, tmp_path / "without", labels=False, workers=1)
     assert "depth_m" not in sources.open_recording(tmp_path / "without", labels=schema.LABELS).description.modalities
     without = sources.open_recording(tmp_path / "out")
     assert "depth_m" not in without.description.modalities | frames_of(without)[0].keys()
@@ -253,7 +256,7 @@ def test_a_malformed_manifest_is_a_data_error(packed, data):
         shutil.copytree(packed, folder)
     (folder / "manifest.json").write_text(json.dumps(content))
     with contextlib.suppress(schema.DataError):
-        frames_of(records.PackedRecording(folder))
+        frames_of(packed_reader.PackedRecording(folder))
 
 
 def test_a_manifest_that_claims_more_than_there_is_takes_no_memory(packed):
@@ -264,7 +267,7 @@ def test_a_manifest_that_claims_more_than_there_is_takes_no_memory(packed):
     content["sequences"] = content["sequences"][:1]
     (packed / "manifest.json").write_text(json.dumps(content))
     with pytest.raises(schema.DataError, match="frames in"):
-        records.PackedRecording(packed)
+        packed_reader.PackedRecording(packed)
 
 
 def record_of(fields, content):
@@ -299,5 +302,5 @@ def test_records_that_lie_are_data_errors_and_take_no_memory(field):
 def test_a_spoilt_entry_of_a_shard_is_written_anew(source, packed):
     for content in ("", "[]", "[" * 100_000, '{"file": "../x"}', "null"):
         (packed / "shard-00001.json").write_text(content)
-        assert shards.pack(source, packed, frames_per_shard=5, workers=1)
-        assert len(frames_of(records.PackedRecording(packed))) == 24
+        assert packed_writer.pack(source, packed, frames_per_shard=5, workers=1)
+        assert len(frames_of(packed_reader.PackedRecording(packed))) == 24

@@ -11,7 +11,9 @@ from PIL import Image
 
 from muvo_jax import config as config_lib
 from muvo_jax import presets
-from muvo_jax.data import pipeline, prepare, recorder, records, schema, shards, sources, windows
+from muvo_jax.data import pipeline, prepare, recorder, schema, sources, windows
+from muvo_jax.data.packed import reader as packed_reader
+from muvo_jax.data.packed import writer as packed_writer
 
 GRID = config_lib.VoxelGrid(shape=(16, 16, 16), voxel_size_m=1.0, origin_m=(-8.0, -8.0, -2.0))
 STRIDE = 2
@@ -76,7 +78,7 @@ def uneven(tmp_path_factory):
 @pytest.mark.parametrize("workers", [1, 2])
 def test_runs_that_lack_fields_lack_them_packed(uneven, tmp_path, workers):
     with pytest.warns(schema.DataWarning, match="is missing in 1 of 5 runs"):
-        assert shards.pack(uneven, tmp_path / "out", frames_per_shard=16, workers=workers)
+        assert packed_writer.pack(uneven, tmp_path / "out", frames_per_shard=16, workers=workers)
     source, packed = opened(uneven, schema.LABELS), opened(tmp_path / "out", schema.LABELS)
     assert {sequence.name: sequence.lacks for sequence in packed.sequences} == {
         "train/a": (), "train/b": ("points_m",), "train/c": ("depth_m", "reward"), "train/d": (), "val_rl/e": ()}
@@ -86,7 +88,7 @@ def test_runs_that_lack_fields_lack_them_packed(uneven, tmp_path, workers):
 
 def test_windows_of_a_pack_pass_by_what_those_of_its_source_do(uneven, tmp_path):
     with pytest.warns(schema.DataWarning):
-        assert shards.pack(uneven, tmp_path / "out", frames_per_shard=16, workers=1)
+        assert packed_writer.pack(uneven, tmp_path / "out", frames_per_shard=16, workers=1)
     for heads, names in (((), ["train/a", "train/c", "train/d"]), (("depth",), ["train/a", "train/d"])):
         labels = {"depth_m"} if heads else ()
         source, packed = (batch_of(opened(path, labels), "train", heads) for path in (uneven, tmp_path / "out"))
@@ -114,7 +116,7 @@ def test_moving_masks_labels_and_step_actions_survive(tmp_path):
             "route_map": rng.integers(0, 255, (64, 64), np.uint8), "birds_eye_instances": instances.astype(np.int32),
             "birds_eye_classes": rng.integers(0, 4, GRID.shape[:2], np.uint8)})
     writer.close()
-    assert shards.pack(root, tmp_path / "out", frames_per_shard=4, workers=1)
+    assert packed_writer.pack(root, tmp_path / "out", frames_per_shard=4, workers=1)
     source, packed = (opened(path, schema.LABELS) for path in (root, tmp_path / "out"))
     assert source.description.modalities >= schema.LABELS | {"image_moving_mask", "occupancy_moving_mask"}
     assert_equal(source, packed)
@@ -134,7 +136,7 @@ def test_pictures_are_packed_as_the_camera_was_held(tmp_path):
         path.unlink()
         top_is_bright = np.repeat(np.linspace(250, 5, 32).astype(np.uint8), 64 * 3).reshape(32, 64, 3)
         Image.fromarray(top_is_bright).save(path.with_suffix(".jpg"), exif=exif)
-    assert shards.pack(root, tmp_path / "out", workers=1)
+    assert packed_writer.pack(root, tmp_path / "out", workers=1)
     source, packed = opened(root), opened(tmp_path / "out")
     assert_equal(source, packed)
     image = packed.read(packed.sequences[0], 0)["image"]
@@ -143,7 +145,7 @@ def test_pictures_are_packed_as_the_camera_was_held(tmp_path):
 
 def test_a_manifest_from_before_is_still_read(tmp_path):
     root = writers.write_plain(tmp_path / "source", {"train/a": 6})
-    assert shards.pack(root, tmp_path / "out", workers=1)
+    assert packed_writer.pack(root, tmp_path / "out", workers=1)
     path = tmp_path / "out/manifest.json"
     content = json.loads(path.read_text())
     assert "lacks" not in content["sequences"][0]  # as ever, where nothing is lacking
@@ -167,10 +169,10 @@ def test_a_manifest_from_before_is_still_read(tmp_path):
 ])
 def test_lacks_and_scales_that_cannot_be_are_refused(tmp_path, change, message):
     root = writers.write_plain(tmp_path / "source", {"train/a": 3})
-    assert shards.pack(root, tmp_path / "out", workers=1)
+    assert packed_writer.pack(root, tmp_path / "out", workers=1)
     path = tmp_path / "out/manifest.json"
     content = json.loads(path.read_text())
     change(content)
     path.write_text(json.dumps(content))
     with pytest.raises(schema.DataError, match=f"manifest.json.*{message}"):
-        records.PackedRecording(tmp_path / "out")
+        packed_reader.PackedRecording(tmp_path / "out")

@@ -1,4 +1,4 @@
-"""Writes the shards that records.py reads: each whole or not at all, by several processes and machines at once.
+"""Writes the shards that reader.py reads: each whole or not at all, by several processes and machines at once.
 
 Beside each shard lies what it was made of (its frames, and a fingerprint of their runs' files), so that a source that
 was corrected since makes those shards anew that it touches.
@@ -14,7 +14,8 @@ from typing import NamedTuple
 
 from array_record.python import array_record_module
 
-from muvo_jax.data import fingerprints, manifest, processes, recorder, records, schema, sources
+from muvo_jax.data import processes, recorder, schema, sources
+from muvo_jax.data.packed import fingerprints, manifest, records
 
 PLAN_FILE = "plan.json"
 _CORRECTED = ("sequences", "frames_of_splits")  # what of a plan a corrected source may change

@@ -16,7 +16,7 @@ from muvo_jax import command_line, late
 with late.imports():
     from muvo_jax import config as config_lib
     from muvo_jax import presets
-    from muvo_jax.data import checkup, files, prepare, schema, sources, words
+    from muvo_jax.data import checkup, prepare, schema, sequences, sources, words
     from muvo_jax.ops import voxels as voxel_ops
     from muvo_jax.training import screen
     from muvo_jax.viz import canvas, checks
@@ -63,7 +63,7 @@ def examine(options: Options, show: screen.Screen) -> checkup.Checkup:
         described, result = None, checkup.refused(f"{name} ({kind.name})", error)
     else:
         described = recording.description
-        problems, gaps = ([text for category, text in warned if issubclass(category, files.GapWarning) == is_gap]
+        problems, gaps = ([text for category, text in warned if issubclass(category, sequences.GapWarning) == is_gap]
                           for is_gap in (False, True))
         with show.counter("looking at", "frames") as progress:
             result = checkup.examine(recording, problems, frames=options.frames, workers=options.workers, gaps=gaps,

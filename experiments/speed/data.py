@@ -24,9 +24,10 @@ from PIL import Image
 
 from muvo_jax import config as config_lib
 from muvo_jax import presets
-from muvo_jax.data import pipeline, prepare, recorder, schema, sources
+from muvo_jax.data import pipeline, prepare, schema, sources
 from muvo_jax.data.packed import manifest, records
 from muvo_jax.data.packed import writer as packed_writer
+from muvo_jax.data.plain import writer as plain_writer
 from muvo_jax.interop.weights_rule import make_input
 from muvo_jax.ops import camera, range_view, voxels
 
@@ -129,9 +130,9 @@ def write_paper_size(recording: schema.Recording, folder: pathlib.Path) -> schem
     intrinsics = camera.intrinsics_from_fov(960, 600, math.radians(110))
     pinhole = schema.Camera(960, 600, tuple(map(tuple, intrinsics.tolist())),
                             tuple(map(tuple, camera.level_camera_to_ego(lidar.position_m).tolist())))
-    recorder.write_description(folder, name="large", rate_hz=10.0, splits=("train",), camera=pinhole, lidar=lidar,
-                               voxels=grid, contract=recording.description.contract)
-    writer, rng = recorder.RunWriter(folder, "train", "run"), np.random.default_rng(0)
+    plain_writer.write_description(folder, name="large", rate_hz=10.0, splits=("train",), camera=pinhole, lidar=lidar,
+                                   voxels=grid, contract=recording.description.contract)
+    writer, rng = plain_writer.RunWriter(folder, "train", "run"), np.random.default_rng(0)
     points_m = make_input("rv_cloud", (60000,), "cloud").astype(np.float32)
     occupancy = voxels.occupancy_target(points_m, np.array(lidar.position_m, np.float32), grid)
     for index in range(FRAMES):

@@ -10,7 +10,7 @@ import numpy as np
 
 from muvo_jax import config as config_lib
 from muvo_jax.data import alignment as alignment_lib
-from muvo_jax.data import schema
+from muvo_jax.data import schema, sequences
 
 # A window of the paper: 12 frames, every second recorded one.
 _WINDOW_FRAMES = 23
@@ -66,7 +66,7 @@ def of_splits(recording: schema.Recording) -> list[Finding]:
     if not any(split.startswith("val") for split in splits):
         found.append(Finding("remark", "there is no validation split: nothing can be judged on unseen drives."))
     for split in splits:
-        longest = schema.longest(recording.sequences, split)
+        longest = sequences.longest(recording.sequences, split)
         if longest < _WINDOW_FRAMES:
             found.append(Finding("remark", f"the longest sequence of {split} has {longest} frames; the paper's windows "
                                            f"(12 frames, every second one) need {_WINDOW_FRAMES}."))

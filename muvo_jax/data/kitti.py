@@ -25,7 +25,7 @@ import warnings
 import numpy as np
 
 from muvo_jax import config as config_lib
-from muvo_jax.data import files, schema
+from muvo_jax.data import files, schema, sequences
 from muvo_jax.data.kitti_files import LIDAR_HEIGHT_M, read_camera, read_oxts, read_pose, read_scan, text_lines
 
 __all__ = ["CAMERAS", "CONTRACT", "LIDAR", "LIDAR_HEIGHT_M", "KittiRecording", "derive_action", "find_drives",
@@ -231,16 +231,16 @@ def _read_timestamps(path: pathlib.Path, frame_ids: np.ndarray, present: np.ndar
             raise schema.DataError(f"{path}: line {frame_id + 1} (the time of frame {frame_id}) is missing or not like "
                                    f"2011-09-26 13:02:25.964000000; found {found}. Take the file of the original "
                                    f"drive.") from error
-    files.check_increasing(times_s[present], [f"{path}, line {frame_id + 1}" for frame_id in frame_ids[present]])
+    sequences.check_increasing(times_s[present], [f"{path}, line {frame_id + 1}" for frame_id in frame_ids[present]])
     return times_s
 
 
 def _cut(drive: _Drive, period_s: float) -> list[schema.Sequence]:
     """The gap-free sequences of a drive, split at two thirds; warns of gaps."""
     boundary = len(drive.present) * 2 // 3
-    late = files.after_gap(drive.timestamps_s, period_s)
-    pieces = files.gap_free(drive.present, late | (np.arange(len(late)) == boundary))
+    late = sequences.after_gap(drive.timestamps_s, period_s)
+    pieces = sequences.gap_free(drive.present, late | (np.arange(len(late)) == boundary))
     name = drive.folder.resolve().name
-    files.warn_of_gaps(name, drive.present, drive.absent, late, len(pieces))
+    sequences.warn_of_gaps(name, drive.present, drive.absent, late, len(pieces))
     return [schema.Sequence(split="train" if start < boundary else "val", name=name, start=start, length=length)
             for start, length in pieces]

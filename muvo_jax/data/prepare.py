@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 from muvo_jax import config as config_lib
-from muvo_jax.data import schema
+from muvo_jax.data import schema, sequences
 from muvo_jax.ops import camera as camera_ops
 from muvo_jax.ops import range_view as range_view_ops
 from muvo_jax.ops import voxels as voxel_ops
@@ -336,7 +336,7 @@ def _by(shape: tuple[int, ...]) -> str:
 
 def _fit_windows(data: config_lib.DataConfig, recording: schema.Recording, keep: Collection[str],
                  needs: Collection[str], notes: list[str]) -> config_lib.DataConfig:
-    lengths = {split: schema.longest(recording.sequences, split, needs) for split in recording.description.splits}
+    lengths = {split: sequences.longest(recording.sequences, split, needs) for split in recording.description.splits}
     if lengths.get("train", 0) < SHORT_RECORDING_FRAMES and _too_long(data, lengths):
         changes: dict = {name: value for name, value in _SHORT.items() if f"data.{name}" not in keep}
         data = dataclasses.replace(data, **changes)
@@ -367,8 +367,8 @@ def span(frames: int, stride: int) -> int:
 def too_short(recording: schema.Recording, split: str, frames: int, stride: int,
               needs: Collection[str] = ()) -> schema.DataError:
     """The error for a split without a single window of frames that have what is needed; names both lengths."""
-    found = schema.longest(recording.sequences, split, needs)
-    every = schema.longest(recording.sequences, split)
+    found = sequences.longest(recording.sequences, split, needs)
+    every = sequences.longest(recording.sequences, split)
     start = f"recording {recording.description.name!r}: the longest gap-free sequence of split {split!r}"
     if every >= span(frames, stride) > found:
         lacking = sorted({name for sequence in recording.sequences if sequence.split == split

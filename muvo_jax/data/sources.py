@@ -6,11 +6,12 @@ import pathlib
 from collections.abc import Callable, Collection
 from typing import Any, NamedTuple
 
-from muvo_jax.data import files, kitti, plain, schema
+from muvo_jax.data import files, kitti, schema
 from muvo_jax.data.muvo import reader as muvo_reader
 from muvo_jax.data.muvo import runs as muvo_runs
 from muvo_jax.data.packed import manifest
 from muvo_jax.data.packed import reader as packed_reader
+from muvo_jax.data.plain import reader as plain_reader
 
 
 class Kind(NamedTuple):
@@ -37,8 +38,8 @@ KINDS = (
     Kind("packed", f"a folder of shards with {manifest.MANIFEST_FILE}",
          lambda path: (path / manifest.MANIFEST_FILE).is_file(), packed_reader.PackedRecording,
          options=("labels", "corrupt")),
-    Kind("plain", f"a folder with {plain.DESCRIPTION_FILE}",
-         lambda path: (path / plain.DESCRIPTION_FILE).is_file(), plain.PlainRecording),
+    Kind("plain", f"a folder with {plain_reader.DESCRIPTION_FILE}",
+         lambda path: (path / plain_reader.DESCRIPTION_FILE).is_file(), plain_reader.PlainRecording),
     Kind("KITTI raw", "<date>/<date>_drive_NNNN_sync folders, or one of them",
          lambda path: bool(kitti.find_drives(path)), kitti.KittiRecording, kitti.CAMERAS, options=("camera",)),
     Kind("MUVO CARLA", f"trainval/<mode>/<Town>/<run> folders with {muvo_runs.FRAME_FILE}, or one of them",

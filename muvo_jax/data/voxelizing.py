@@ -26,11 +26,12 @@ from typing import NamedTuple
 import numpy as np
 
 from muvo_jax import config as config_lib
-from muvo_jax.data import description, files, plain, processes, recorder, schema
+from muvo_jax.data import description, files, processes, schema
 from muvo_jax.data.muvo import files as muvo_files
 from muvo_jax.data.muvo import frame_pickle, safe_pickle
 from muvo_jax.data.muvo import reader as muvo_reader
 from muvo_jax.data.muvo import runs as muvo_runs
+from muvo_jax.data.plain import reader as plain_reader
 from muvo_jax.ops import camera as camera_ops
 from muvo_jax.ops import voxels as voxel_ops
 
@@ -97,7 +98,7 @@ def voxelize(path: pathlib.Path | str, *, rule: str = "carved", overwrite: bool 
         missing = [frame for frame in frames if not is_whole(frame.target)]
         for folder in {frame.target.parent for frame in missing}:
             folder.mkdir(exist_ok=True)
-            recorder.write_atomically(folder / RULE_FILE, rule_text)
+            files.write_atomically(folder / RULE_FILE, rule_text)
         kept = len(frames) - len(missing)
         chunks = [missing[first:first + _CHUNK] for first in range(0, len(missing), _CHUNK)]
         workers = min(workers or processes.processors(), len(chunks))
@@ -125,7 +126,7 @@ def make_frames(rig: Rig, frames: list[Frame]) -> list[str]:
     outcomes = []
     for frame in frames:
         try:
-            recorder.write_atomically(frame.target, _content(rig, frame))
+            files.write_atomically(frame.target, _content(rig, frame))
         except schema.DataError as error:
             outcomes.append(str(error))
         else:
@@ -182,13 +183,13 @@ def carved_occupancy(depth_m: np.ndarray, points_m: np.ndarray, intrinsics: np.n
 
 def _survey(path: pathlib.Path, rule: str) -> tuple[Rig, dict[pathlib.Path, list[Frame]]]:
     """What is measured with, and the frames of every run by its folder; checks that there is depth and lidar."""
-    if (path / plain.DESCRIPTION_FILE).is_file():
+    if (path / plain_reader.DESCRIPTION_FILE).is_file():
         rig, runs = _survey_plain(path, rule)
     elif path.is_dir() and muvo_runs.folders(path):
         rig, runs = _survey_muvo(path, rule)
     else:
         raise schema.DataError(f"{path} is no recording whose occupancy can be made; expected a plain one (a folder "
-                               f"with {plain.DESCRIPTION_FILE}) or runs of the MUVO layout (with "
+                               f"with {plain_reader.DESCRIPTION_FILE}) or runs of the MUVO layout (with "
                                f"{muvo_runs.FRAME_FILE}).")
     for folder, frames in runs.items():
         for what, places in (("depth map", {frame.depth for frame in frames}),
@@ -201,15 +202,15 @@ def _survey(path: pathlib.Path, rule: str) -> tuple[Rig, dict[pathlib.Path, list
 
 
 def _survey_plain(path: pathlib.Path, rule: str) -> tuple[Rig, dict[pathlib.Path, list[Frame]]]:
-    toml_path = path / plain.DESCRIPTION_FILE
-    header = plain.read_header(path)
+    toml_path = path / plain_reader.DESCRIPTION_FILE
+    header = plain_reader.read_header(path)
     if "voxels" not in header:
         raise schema.DataError(f"{toml_path}: no section [voxels], the grid to fill; add one, such as [voxels] shape = "
                                f"[192, 192, 64], voxel_size_m = 0.5, origin_m = [-48.0, -48.0, -6.0].")
     camera, lidar, grid = (description.section(header, name, toml_path, required=True)
                            for name in ("camera", "lidar", "voxels"))
     runs = {}
-    for run in plain.read_runs(path, tuple(description.field(header, "splits", list, toml_path))):
+    for run in plain_reader.read_runs(path, tuple(description.field(header, "splits", list, toml_path))):
         names = [f"{int(number):06d}" for number in run.columns["frame_id"]]
         runs[run.folder] = [Frame(run.folder / "depth" / f"{name}.png", run.folder / "lidar" / f"{name}.npz",
                                   run.folder / "occupancy" / f"{name}.npz") for name in names]
@@ -258,7 +259,7 @@ def _content(rig: Rig, frame: Frame) -> bytes:
         keep: Callable[[np.ndarray], np.ndarray] = _without_own_car
         depth_m, points_m = np.where(depth < 1.0, depth * muvo_files.DEPTH_RANGE_M, np.inf), scan.points_m
     else:
-        depth_m = plain.decode_depth(files.read_image(frame.depth, None))
+        depth_m = plain_reader.decode_depth(files.read_image(frame.depth, None))
         points_m = files.read_npz(frame.points, "points_m").astype(np.float32)
         if depth_m.ndim != 2 or points_m.shape[1:] != (3,):
             raise schema.DataError(f"{frame.depth}, {frame.points}: depth of shape {list(depth_m.shape)}, points of "
@@ -272,7 +273,7 @@ def _content(rig: Rig, frame: Frame) -> bytes:
     else:
         occupancy = carved_occupancy(depth_m, points_m, intrinsics, camera_to_ego, rig.lidar_position_m, rig.grid,
                                      keep=keep)
-    return recorder.npz_bytes({"occupancy": occupancy})
+    return files.npz_bytes({"occupancy": occupancy})
 
 
 def _reference_table(rig: Rig, frame: Frame, depth_m: np.ndarray, tags: np.ndarray,
@@ -325,4 +326,4 @@ def _add_column(folder: pathlib.Path, frames: list[Frame]) -> None:
     names = [frame.target.relative_to(folder).as_posix() for frame in frames]
     if not (folder / ORIGINAL_FRAME_FILE).exists():
         shutil.copyfile(path, folder / ORIGINAL_FRAME_FILE)
-    recorder.write_atomically(path, frame_pickle.frame(dict(columns) | {"voxel_path": names}))
+    files.write_atomically(path, frame_pickle.frame(dict(columns) | {"voxel_path": names}))

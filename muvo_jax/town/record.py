@@ -21,7 +21,8 @@ from typing import IO, NamedTuple, cast
 import numpy as np
 
 from muvo_jax import config as config_lib
-from muvo_jax.data import processes, recorder, schema
+from muvo_jax.data import files, processes, schema
+from muvo_jax.data.plain import writer as plain_writer
 from muvo_jax.town import driver, settings
 from muvo_jax.town.simulator import WEATHER_NAMES, Town, TownState
 
@@ -109,7 +110,7 @@ def record_town(directory: pathlib.Path | str, town_config: settings.TownConfig,
     planned = jobs(size)
     describe(directory, town_config, tuple(settings.SIZES[size]))
     with processes.locked(directory / ".lock", "recording", wait=True):
-        missing = [job for job in planned if not recorder.is_complete(directory, job.split, job.run)]
+        missing = [job for job in planned if not plain_writer.is_complete(directory, job.split, job.run)]
         total = sum(job.frames for job in planned)
         done = total - sum(job.frames for job in missing)
         if workers is None:
@@ -120,8 +121,8 @@ def record_town(directory: pathlib.Path | str, town_config: settings.TownConfig,
             done += count
             if progress is not None:
                 progress(done, total)
-        recorder.write_atomically(directory / COMPLETE_FILE,
-                                  json.dumps({"frames": total, "version": RECORDING_VERSION}))
+        files.write_atomically(directory / COMPLETE_FILE,
+                               json.dumps({"frames": total, "version": RECORDING_VERSION}))
     return directory
 
 
@@ -129,14 +130,14 @@ def describe(directory: pathlib.Path, town_config: settings.TownConfig, splits: 
     """Writes the recording's description."""
     camera = schema.Camera.level(town_config.camera_width_px, town_config.camera_height_px, town_config.camera_fov_rad,
                                  town_config.lidar.position_m)
-    recorder.write_description(directory, name="town", rate_hz=town_config.contract.rate_hz, splits=splits,
-                               contract=town_config.contract, camera=camera, lidar=town_config.lidar,
-                               voxels=town_config.voxels)
+    plain_writer.write_description(directory, name="town", rate_hz=town_config.contract.rate_hz, splits=splits,
+                                   contract=town_config.contract, camera=camera, lidar=town_config.lidar,
+                                   voxels=town_config.voxels)
 
 
 def record_run(directory: pathlib.Path, town: Town, job: TownDrive) -> Iterator[int]:
     """Records one run, yielding 1 after each frame. A drive that ends early ends the run early."""
-    writer = recorder.RunWriter(directory, job.split, job.run)
+    writer = plain_writer.RunWriter(directory, job.split, job.run)
     state = town.reset(job.seed, job.weather)
     for _ in range(WARM_UP_FRAMES):
         state = town.step(state, town.expert(state))

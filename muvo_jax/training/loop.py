@@ -19,7 +19,7 @@ import jax
 
 from muvo_jax import config as config_lib
 from muvo_jax import types
-from muvo_jax.data import pipeline, prepare, schema, words
+from muvo_jax.data import pipeline, prepare, schema, sequences, words
 from muvo_jax.objectives import perceptual
 from muvo_jax.training import checkpoint, checkpoint_meta, host, preparation, run_folder, screen, start, validation
 
@@ -91,7 +91,7 @@ def train(job: Job, show: screen.Screen) -> Outcome:
         frames = pipeline.Frames(recording, config)
         source = pipeline.train_batches(frames, seed=config.train.seed, batch=windows_per_step(config))
         shapes = preparation.expected_batch(config, windows_per_step(config),
-                                            recorded=schema.in_every_frame(recording))
+                                            recorded=sequences.in_every_frame(recording))
         ready = early.result()
         ready = (preparation.recompile(ready, config, shapes, job.frozen) if ready
                  else preparation.prepare(config, shapes, job.frozen))

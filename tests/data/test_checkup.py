@@ -11,7 +11,8 @@ import recording_writers as writers
 import street_scene
 
 from muvo_jax import config as config_lib
-from muvo_jax.data import alignment, checkup, figures, judgements, kitti, plain
+from muvo_jax.data import alignment, checkup, figures, judgements, kitti
+from muvo_jax.data.plain import reader as plain_reader
 from muvo_jax.ops import camera as camera_ops
 
 CONTRACT = config_lib.ActionContract()
@@ -163,7 +164,7 @@ def test_damaged_and_faulty_frames_are_counted(tmp_path):
     root = writers.write_plain(tmp_path / "rec")
     (root / "train/a/image/000004.png").write_bytes(b"")
     np.savez(root / "train/a/lidar/000005.npz", points_m=np.zeros((0, 3), np.float32))
-    result = checkup.examine(plain.PlainRecording(root), ["a gap"], frames=0)
+    result = checkup.examine(plain_reader.PlainRecording(root), ["a gap"], frames=0)
     texts = [finding.text for finding in result.findings if finding.level == "problem"]
     assert result.problems == len(texts)
     for part in ("a gap", "1 of 24 frames cannot be read: ", "000004.png", "1 of 23 scans are empty",
@@ -174,8 +175,8 @@ def test_damaged_and_faulty_frames_are_counted(tmp_path):
 
 
 def test_stretches_are_spread_and_limited(tmp_path):
-    recording = plain.PlainRecording(writers.write_plain(tmp_path / "rec", {"train/a": 200, "val/b": 5},
-                                                         splits='["train", "val"]'))
+    recording = plain_reader.PlainRecording(writers.write_plain(tmp_path / "rec", {"train/a": 200, "val/b": 5},
+                                                                splits='["train", "val"]'))
     result = checkup.examine(recording, frames=120)
     assert result.facts["read"] == "65 of 65 frames looked at"
     assert set(result.motion.stretch) == {0, 1}
@@ -207,12 +208,12 @@ def test_points_in_centimetres_are_found(tmp_path):
     root = writers.write_plain(tmp_path / "rec")
     for path in root.glob("*/*/lidar/*.npz"):
         np.savez(path, points_m=np.random.default_rng(0).uniform(-4000, 4000, (100, 3)).astype(np.float32))
-    texts = [finding.text for finding in checkup.examine(plain.PlainRecording(root)).findings]
+    texts = [finding.text for finding in checkup.examine(plain_reader.PlainRecording(root)).findings]
     assert any("are they in metres?" in text for text in texts)
 
 
 def test_pixels_and_points_of_unknown_class_are_no_problem(tmp_path):
-    described = dataclasses.replace(plain.PlainRecording(writers.write_plain(tmp_path / "rec")).description,
+    described = dataclasses.replace(plain_reader.PlainRecording(writers.write_plain(tmp_path / "rec")).description,
                                     classes=("sky", "road"))
     for classes, said in (([0, 1, 255], False), ([0, 2, 255], True)):
         counted = figures.Figures(described)
@@ -223,7 +224,7 @@ def test_pixels_and_points_of_unknown_class_are_no_problem(tmp_path):
 
 
 def test_nothing_to_look_at_is_a_problem(tmp_path):
-    described = plain.PlainRecording(writers.write_plain(tmp_path / "rec")).description
+    described = plain_reader.PlainRecording(writers.write_plain(tmp_path / "rec")).description
     empty = types.SimpleNamespace(sequences=(), description=described)
     assert any("not one frame" in finding.text and finding.level == "problem"
                for finding in checkup.examine(empty).findings)

@@ -9,7 +9,8 @@ import recording_writers as writers
 
 from muvo_jax import config as config_lib
 from muvo_jax import presets
-from muvo_jax.data import kitti, plain, prepare, schema
+from muvo_jax.data import kitti, prepare, schema
+from muvo_jax.data.plain import reader as plain_reader
 
 
 @pytest.fixture
@@ -19,7 +20,7 @@ def kitti_recording(tmp_path):
 
 @pytest.fixture
 def plain_recording(tmp_path):
-    return plain.PlainRecording(writers.write_plain(tmp_path))
+    return plain_reader.PlainRecording(writers.write_plain(tmp_path))
 
 
 def with_description(recording, **changes):
@@ -61,7 +62,7 @@ def test_windows_that_fit_stay(plain_recording):
 
 
 def test_sequences_shorter_than_the_window(tmp_path):
-    recording = plain.PlainRecording(writers.write_plain(tmp_path, {"train/a": 9, "val_rl/b": 7}))
+    recording = plain_reader.PlainRecording(writers.write_plain(tmp_path, {"train/a": 9, "val_rl/b": 7}))
     with pytest.raises(schema.DataError, match="'val_rl' has 7 frames, but a window of 8 frames at stride 1 needs 8"):
         prepare.adapt(presets.get("town"), recording)
     keep = {"data.frames": 8, "data.stride": 2}

@@ -7,8 +7,9 @@ import pytest
 import recording_samples as samples
 
 from muvo_jax import presets
-from muvo_jax.data import pipeline, plain, prepare, schema
+from muvo_jax.data import pipeline, prepare, schema
 from muvo_jax.data.muvo import reader as muvo_reader
+from muvo_jax.data.plain import reader as plain_reader
 from muvo_jax.ops import camera, range_view
 from muvo_jax.town import boxes, record, settings
 from muvo_jax.town.simulator import Town
@@ -26,7 +27,7 @@ def recording(tmp_path_factory):
     record.describe(folder, town_config, ("train",))
     for _ in record.record_run(folder, Town(town_config), record.TownDrive("train", "000_day", 7, "clear_noon", 8)):
         pass
-    return plain.PlainRecording(folder, labels=prepare.labels(CONFIG))
+    return plain_reader.PlainRecording(folder, labels=prepare.labels(CONFIG))
 
 
 def test_the_town_teaches_every_optional_head(recording):
@@ -76,7 +77,7 @@ def test_the_ground_plan_holds_the_road_and_whole_vehicles(recording):
 
 
 def test_labels_are_read_only_where_asked_for(recording):
-    usual = plain.PlainRecording(next(iter(recording._runs.values())).folder.parents[1])
+    usual = plain_reader.PlainRecording(next(iter(recording._runs.values())).folder.parents[1])
     assert not schema.LABELS & usual.read(usual.sequences[0], 0).keys()
     with pytest.raises(schema.DataError, match="head 'depth' learns from depth_m"):
         prepare.check_targets(dataclasses.replace(CONFIG, loss=presets.tiny().loss), usual.description)

@@ -9,10 +9,12 @@ import recording_writers as writers
 from PIL import Image
 
 from muvo_jax import voxelize as command
-from muvo_jax.data import plain, recorder, schema, voxelizing
+from muvo_jax.data import schema, voxelizing
 from muvo_jax.data.muvo import reader as muvo_reader
 from muvo_jax.data.muvo import runs as muvo_runs
 from muvo_jax.data.muvo import safe_pickle
+from muvo_jax.data.plain import reader as plain_reader
+from muvo_jax.data.plain import writer as plain_writer
 
 needs_layout = pytest.mark.skipif(samples.MUVO_LAYOUT is None,
                                   reason="no recording in the MUVO layout here; name one by MUVO_LAYOUT=FOLDER")
@@ -33,7 +35,7 @@ def recording(tmp_path):
         (run / "depth").mkdir()
         for frame in range(2):
             Image.new("RGB", (3, 3)).save(run / f"image/{frame:06d}.png")
-            Image.fromarray(recorder.encode_depth(depth_m)).save(run / f"depth/{frame:06d}.png")
+            Image.fromarray(plain_writer.encode_depth(depth_m)).save(run / f"depth/{frame:06d}.png")
             np.savez(run / f"lidar/{frame:06d}.npz", points_m=np.array([[-3.5, 5.5, 0.5]], np.float32))
     return root
 
@@ -51,7 +53,7 @@ def test_rays_carve_what_they_pass_and_the_rest_is_unknown(recording):
     expected[0:5, 8, 2], expected[5, 8, 2] = 0, 1  # the camera: from x -7.5 to -2.5
     expected[0:4, 13, 2], expected[4, 13, 2] = 0, 1  # the lidar: to x -3.5
     np.testing.assert_array_equal(grid, expected)
-    read = plain.PlainRecording(recording)
+    read = plain_reader.PlainRecording(recording)
     np.testing.assert_array_equal(read.read(read.sequences[-1], 1)["occupancy"], expected)
 
 
@@ -105,7 +107,7 @@ def test_missing_sensors_are_told_before_anything_is_written(recording, tmp_path
     with pytest.raises(schema.DataError, match="no frame has a lidar scan"):
         voxelizing.voxelize(recording)
     assert not list(recording.glob("*/*/occupancy"))
-    header = recording / plain.DESCRIPTION_FILE
+    header = recording / plain_reader.DESCRIPTION_FILE
     header.write_text(header.read_text().partition("[voxels]")[0])
     with pytest.raises(schema.DataError, match=r"no section \[voxels\], the grid to fill; add one"):
         voxelizing.voxelize(recording)

@@ -10,8 +10,9 @@ from typing import NamedTuple
 import numpy as np
 
 from muvo_jax import config as config_lib
-from muvo_jax.data import plain, recorder
 from muvo_jax.data.muvo import reader as muvo_reader
+from muvo_jax.data.plain import reader as plain_reader
+from muvo_jax.data.plain import writer as plain_writer
 
 # The paper's section IV: 25 runs of 300 s in each town for training, 5 in each for either validation set.
 TOWNS = ("Town01", "Town03", "Town04", "Town06")
@@ -100,7 +101,7 @@ class Estimate(NamedTuple):
 
 def estimate(out: pathlib.Path, jobs: Sequence[CarlaDrive], settings: Settings) -> Estimate:
     """See Estimate."""
-    complete = [job for job in jobs if recorder.is_complete(out, job.split, job.run)]
+    complete = [job for job in jobs if plain_writer.is_complete(out, job.split, job.run)]
     frames = sum(job.frames for job in jobs)
     missing = frames - sum(job.frames for job in complete)
     frame_bytes, frame_s = float(settings.raw_bytes), 1.0 / settings.rate_hz
@@ -108,7 +109,7 @@ def estimate(out: pathlib.Path, jobs: Sequence[CarlaDrive], settings: Settings) 
         folder = out / complete[0].split / complete[0].run
         written = [path.stat() for path in folder.rglob("*") if path.is_file()]
         times = [status.st_mtime for status in written]
-        rows = len((folder / plain.FRAMES_FILE).read_text(encoding="utf-8").splitlines()) - 1
+        rows = len((folder / plain_reader.FRAMES_FILE).read_text(encoding="utf-8").splitlines()) - 1
         frame_bytes = sum(status.st_size for status in written) / rows
         frame_s = (max(times) - min(times)) / rows
     return Estimate(frames, missing, missing * frame_bytes, missing * frame_s / 3600, bool(complete))

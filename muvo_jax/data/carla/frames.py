@@ -63,7 +63,7 @@ def collect(queues: Mapping[str, queue.Queue], frame: int, timeout_s: float) -> 
 
 
 def decode(seen: Tick, settings: Settings) -> dict[str, np.ndarray]:
-    """The measurements of a tick as recorder.RunWriter.write takes them."""
+    """The measurements of a tick as plain.writer.RunWriter.write takes them."""
     pixels = {name: bgra(seen.measurements[name], name, settings) for name in CAMERAS}
     detections = np.frombuffer(seen.measurements["lidar"].raw_data, _DETECTION)
     points_m = muvo_files.to_ego_frame(detections["point"], settings.position_m)

@@ -15,12 +15,13 @@ from typing import Protocol
 
 import numpy as np
 
-from muvo_jax.data import processes, recorder, schema
+from muvo_jax.data import processes, schema
 from muvo_jax.data.carla import frames as carla_frames
 from muvo_jax.data.carla.drives import SPLITS, BadDriveError, CarlaDrive, CarlaError, Settings, estimate
 from muvo_jax.data.carla.frames import SENSORS, Tick
 from muvo_jax.data.muvo import files as muvo_files
 from muvo_jax.data.muvo import reader as muvo_reader
+from muvo_jax.data.plain import writer as plain_writer
 
 ATTEMPTS = 3
 MOVING_MPS = 1.0
@@ -68,7 +69,7 @@ def record(out: pathlib.Path, simulator: Simulator, jobs: Sequence[CarlaDrive], 
 def _record_missing(out: pathlib.Path, simulator: Simulator, jobs: Sequence[CarlaDrive], settings: Settings,
                     progress: Callable[[int, int], None] | None) -> None:
     for job in jobs:
-        if recorder.is_complete(out, job.split, job.run):
+        if plain_writer.is_complete(out, job.split, job.run):
             continue
         needed, free = estimate(out, jobs, settings), shutil.disk_usage(out).free
         if needed.measured and needed.disk_bytes > free:
@@ -88,7 +89,7 @@ def _record_missing(out: pathlib.Path, simulator: Simulator, jobs: Sequence[Carl
 
 def record_run(out: pathlib.Path, simulator: Simulator, job: CarlaDrive, settings: Settings) -> Iterator[int]:
     """Records one run, yielding the number of frames so far; frames.csv is written once all files are there."""
-    writer = recorder.RunWriter(out, job.split, job.run)
+    writer = plain_writer.RunWriter(out, job.split, job.run)
     try:
         seen = simulator.start(job)
         first, route = seen, carla_frames.Route(simulator.route_m())
@@ -172,7 +173,7 @@ def check_written(folder: pathlib.Path, frames: int) -> None:
 
 def _describe(out: pathlib.Path, settings: Settings) -> None:
     camera = schema.Camera.level(settings.width_px, settings.height_px, settings.fov_rad, settings.position_m)
-    recorder.write_description(out, name="CARLA", rate_hz=settings.rate_hz, camera=camera, lidar=settings.lidar,
-                               voxels=muvo_reader.VOXELS, splits=SPLITS,
-                               contract=dataclasses.replace(muvo_reader.CONTRACT, rate_hz=settings.rate_hz),
-                               classes=muvo_files.CLASSES, route_map=muvo_reader.ROUTE_MAP)
+    plain_writer.write_description(out, name="CARLA", rate_hz=settings.rate_hz, camera=camera, lidar=settings.lidar,
+                                   voxels=muvo_reader.VOXELS, splits=SPLITS,
+                                   contract=dataclasses.replace(muvo_reader.CONTRACT, rate_hz=settings.rate_hz),
+                                   classes=muvo_files.CLASSES, route_map=muvo_reader.ROUTE_MAP)

@@ -23,12 +23,13 @@ from collections.abc import Callable, Iterator
 import numpy as np
 from PIL import Image
 
-from muvo_jax.data import description, plain, recorder, schema
+from muvo_jax.data import description, files, schema, sequences
 from muvo_jax.data.muvo import files as muvo_files
 from muvo_jax.data.muvo import frame_pickle
 from muvo_jax.data.muvo import reader as muvo_reader
 from muvo_jax.data.muvo import runs as muvo_runs
 from muvo_jax.data.muvo import tags as muvo_tags
+from muvo_jax.data.plain import reader as plain_reader
 
 # What the town's classes are in CARLA's tags (town/boxes.py: sky, road, marking, pavement, grass, building, ...).
 TOWN_TAGS = np.array([13, 7, 6, 8, 22, 1, 9, 5, 10, 4], np.uint8)
@@ -61,7 +62,7 @@ def export(source: pathlib.Path | str, out: pathlib.Path | str, *, town: str = "
       FileExistsError: where `out` holds an export of other sensors.
     """
     source, out = pathlib.Path(source).expanduser(), pathlib.Path(out).expanduser()
-    recording = plain.PlainRecording(source, labels=_LABELS)
+    recording = plain_reader.PlainRecording(source, labels=_LABELS)
     _check(recording, source)
     _describe(recording.description, out)
     runs = _plan(recording, town)
@@ -76,15 +77,15 @@ def export(source: pathlib.Path | str, out: pathlib.Path | str, *, town: str = "
     table = io.StringIO(newline="")
     rows = [(*pathlib.PurePosixPath(folder).parts, sequence.name, sequence.start) for folder, sequence in runs]
     csv.writer(table, lineterminator="\n").writerows([("mode", "town", "run", "source", "first_frame"), *rows])
-    recorder.write_atomically(out / "runs.csv", table.getvalue())
+    files.write_atomically(out / "runs.csv", table.getvalue())
     return written
 
 
-def _check(recording: plain.PlainRecording, source: pathlib.Path) -> None:
+def _check(recording: plain_reader.PlainRecording, source: pathlib.Path) -> None:
     described = recording.description
     names = {"image": "image", "points_m": "points_m", "route_map": "route_map", "depth_m": "depth",
              "image_classes": "classes"}
-    there = schema.in_every_frame(recording)
+    there = sequences.in_every_frame(recording)
     lacking = [name for field, name in names.items() if field not in there]
     if lacking or described.lidar is None:
         raise schema.DataError(f"{source}: the authors' reader always opens image, depth, classes, points and route "
@@ -94,17 +95,17 @@ def _check(recording: plain.PlainRecording, source: pathlib.Path) -> None:
 def _describe(described: schema.RecordingDescription, out: pathlib.Path) -> None:
     voxels = described.voxels if described.voxels == muvo_reader.VOXELS else None
     route_map = described.route_map if described.route_map != muvo_reader.ROUTE_MAP else None
-    text = recorder.to_toml({"rate_hz": described.rate_hz, "tags": muvo_tags.OLDER},
-                            description.tables(camera=described.camera, lidar=described.lidar,
-                                               action=described.contract, voxels=voxels, route_map=route_map))
+    text = files.to_toml({"rate_hz": described.rate_hz, "tags": muvo_tags.OLDER},
+                         description.tables(camera=described.camera, lidar=described.lidar,
+                                            action=described.contract, voxels=voxels, route_map=route_map))
     path = out / muvo_reader.SENSORS_FILE
     if path.is_file() and path.read_text(encoding="utf-8") != text:
         raise FileExistsError(f"{path} describes other sensors; choose another folder or remove this one.")
     out.mkdir(parents=True, exist_ok=True)
-    recorder.write_atomically(path, text)
+    files.write_atomically(path, text)
 
 
-def _plan(recording: plain.PlainRecording, town: str) -> list[tuple[str, schema.Sequence]]:
+def _plan(recording: plain_reader.PlainRecording, town: str) -> list[tuple[str, schema.Sequence]]:
     """(mode/town/run, sequence): "train" stays, the other splits become val0, val1, ... in their order."""
     others = [split for split in recording.description.splits if split != "train"]
     modes = {"train": "train"} | {split: f"val{index}" for index, split in enumerate(others)}
@@ -119,7 +120,8 @@ def _plan(recording: plain.PlainRecording, town: str) -> list[tuple[str, schema.
     return plan
 
 
-def _write_run(recording: plain.PlainRecording, sequence: schema.Sequence, target: pathlib.Path) -> Iterator[int]:
+def _write_run(recording: plain_reader.PlainRecording, sequence: schema.Sequence,
+               target: pathlib.Path) -> Iterator[int]:
     """Writes one run, the data frame last; yields after each frame."""
     shutil.rmtree(target, ignore_errors=True)
     for kind in (*muvo_files.KINDS, "image_left", "image_right", "image_all"):
@@ -142,7 +144,8 @@ def _write_run(recording: plain.PlainRecording, sequence: schema.Sequence, targe
     draft.replace(target / muvo_runs.FRAME_FILE)
 
 
-def _write_frame(frame: schema.RawFrame, recording: plain.PlainRecording, target: pathlib.Path, number: int) -> None:
+def _write_frame(frame: schema.RawFrame, recording: plain_reader.PlainRecording, target: pathlib.Path,
+                 number: int) -> None:
     described = recording.description
     assert described.lidar is not None
     tags_of = _layout_tags(recording)
@@ -169,7 +172,7 @@ def _write_frame(frame: schema.RawFrame, recording: plain.PlainRecording, target
         np.save(path("voxel"), np.stack([x, y, z, np.full(len(x), _OTHER_TAG)], axis=1).astype(np.uint16))
 
 
-def _layout_tags(recording: plain.PlainRecording) -> np.ndarray:
+def _layout_tags(recording: plain_reader.PlainRecording) -> np.ndarray:
     """uint8 [256], class of the recording -> tag of the layout, by name; without names they are the layout's already.
 
     The town names none and has its own.

@@ -24,7 +24,7 @@ import pathlib
 import numpy as np
 
 from muvo_jax import config as config_lib
-from muvo_jax.data import description, ego_motion, fields, files, runs, schema
+from muvo_jax.data import description, ego_motion, fields, files, runs, schema, sequences
 from muvo_jax.data.muvo import files as muvo_files
 from muvo_jax.data.muvo import runs as muvo_runs
 from muvo_jax.data.muvo import tags as muvo_tags
@@ -163,9 +163,9 @@ class MuvoRecording:
             present &= there
             absent[kind] = int((~there).sum())
         times_s = self._columns[run.name]["timestamp_s"]
-        late = files.after_gap(times_s, 1.0 / rate_hz)
-        pieces = files.gap_free(present, late)
-        files.warn_of_gaps(str(run.folder), present, absent, late, len(pieces))
+        late = sequences.after_gap(times_s, 1.0 / rate_hz)
+        pieces = sequences.gap_free(present, late)
+        sequences.warn_of_gaps(str(run.folder), present, absent, late, len(pieces))
         first = int(np.searchsorted(times_s, times_s[0] + skipped_s - 0.5 / rate_hz))
         cut = [(max(start, first), start + length) for start, length in pieces]
         return [schema.Sequence(run.split, run.name, start, stop - start, lacks) for start, stop in cut if stop > start]

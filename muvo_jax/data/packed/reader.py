@@ -56,7 +56,7 @@ class PackedRecording:
         if damaged and corrupt == "raise":
             number, fault = next(iter(damaged.items()))
             raise records.damaged(str(self._root / self._shards[number]["file"]),
-                           f"{fault}; {len(damaged)} of {len(self._shards)} shards are damaged")
+                                  f"{fault}; {len(damaged)} of {len(self._shards)} shards are damaged")
         whole = [schema.Sequence(**sequence) for sequence in manifest["sequences"]]
         self._first: dict[tuple[str, int], int] = {}  # (run, frame of the run) -> number of the record
         kept: list[schema.Sequence] = []

@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 from array_record.python import array_record_module
 
-from muvo_jax.data import processes, recorder, schema, sources
+from muvo_jax.data import files, processes, schema, sources
 from muvo_jax.data.packed import fingerprints, manifest, records
 
 PLAN_FILE = "plan.json"
@@ -81,7 +81,7 @@ def pack(source: pathlib.Path | str, out: pathlib.Path | str, *, encoding: recor
         if None in entries:
             return False
         _remove_more(out, len(shards))
-        recorder.write_atomically(out / manifest.MANIFEST_FILE, json.dumps(
+        files.write_atomically(out / manifest.MANIFEST_FILE, json.dumps(
             plan | {"frames": sum(shard.frames for shard in shards), "shards": entries}, indent=1, ensure_ascii=False))
     return True
 
@@ -105,7 +105,7 @@ def write_shard(recording: schema.Recording, out: pathlib.Path, encoding: record
     entry = {"file": path.name, "frames": shard.frames, "bytes": draft.stat().st_size,
              "sha256": manifest.file_sha256(draft)}
     os.replace(draft, path)
-    recorder.write_atomically(path.with_suffix(".json"), json.dumps(entry | {"source": shard.source}))
+    files.write_atomically(path.with_suffix(".json"), json.dumps(entry | {"source": shard.source}))
 
 
 def _write_all(recording: schema.Recording, out: pathlib.Path, shards: list[Shard], encoding: records.Encoding,
@@ -163,7 +163,7 @@ def _keep_plan(out: pathlib.Path, plan: dict) -> None:
         (out / manifest.MANIFEST_FILE).unlink(missing_ok=True)
     elif any(out.glob("shard-*")):
         raise FileExistsError(f"{out} holds shards without their {PLAN_FILE}; choose another folder.")
-    recorder.write_atomically(path, json.dumps(plan, indent=1, ensure_ascii=False))
+    files.write_atomically(path, json.dumps(plan, indent=1, ensure_ascii=False))
 
 
 def _shards(recording: schema.Recording, source: pathlib.Path, frames_per_shard: int) -> list[Shard]:

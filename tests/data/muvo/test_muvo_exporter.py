@@ -6,12 +6,14 @@ import recording_samples as samples
 import recording_writers as writers
 
 from muvo_jax import config as config_lib
-from muvo_jax.data import plain, recorder, schema, sources
+from muvo_jax.data import schema, sources
 from muvo_jax.data.muvo import exporter as muvo_exporter
 from muvo_jax.data.muvo import files as muvo_files
 from muvo_jax.data.muvo import reader as muvo_reader
 from muvo_jax.data.muvo import runs as muvo_runs
 from muvo_jax.data.muvo import safe_pickle
+from muvo_jax.data.plain import reader as plain_reader
+from muvo_jax.data.plain import writer as plain_writer
 from muvo_jax.ops import camera as camera_ops
 
 FRAMES = 14
@@ -26,10 +28,10 @@ def source(tmp_path_factory):
     intrinsics = camera_ops.intrinsics_from_fov(64, 32, np.pi / 2)
     pose = camera_ops.level_camera_to_ego((1.0, 0.0, 2.0))
     camera = schema.Camera(64, 32, tuple(map(tuple, intrinsics.tolist())), tuple(map(tuple, pose.tolist())))
-    recorder.write_description(root, name="mine", rate_hz=10, splits=("train", "val_rl"), camera=camera, lidar=LIDAR,
-                               contract=config_lib.ActionContract(), voxels=muvo_reader.VOXELS)
+    plain_writer.write_description(root, name="mine", rate_hz=10, splits=("train", "val_rl"), camera=camera,
+                                   lidar=LIDAR, contract=config_lib.ActionContract(), voxels=muvo_reader.VOXELS)
     for split, run in (("train", "a"), ("val_rl", "b")):
-        writer = recorder.RunWriter(root, split, run)
+        writer = plain_writer.RunWriter(root, split, run)
         for frame_id in range(FRAMES):
             occupancy = np.zeros(muvo_reader.VOXELS.shape, np.uint8)
             occupancy[frame_id, 100, 3] = 1
@@ -52,7 +54,7 @@ def exported(source, tmp_path_factory):
 
 
 def test_what_is_read_back_is_what_was_recorded(source, exported):
-    before, after = plain.PlainRecording(source), sources.open_recording(exported)
+    before, after = plain_reader.PlainRecording(source), sources.open_recording(exported)
     assert after.description.splits == ("train", "val0") and after.description.lidar == LIDAR
     assert after.description.camera == before.description.camera
     sequence = after.sequences[0]

@@ -8,7 +8,7 @@ import pytest
 from PIL import Image
 
 from muvo_jax import config as config_lib
-from muvo_jax.data import plain, recorder, schema, sources
+from muvo_jax.data import schema, sources
 from muvo_jax.data.carla import recorder as carla_recorder
 from muvo_jax.data.muvo import exporter as muvo_exporter
 from muvo_jax.data.muvo import files as muvo_files
@@ -17,6 +17,8 @@ from muvo_jax.data.muvo import reader as muvo_reader
 from muvo_jax.data.muvo import runs as muvo_runs
 from muvo_jax.data.muvo import tags as muvo_tags
 from muvo_jax.data.packed import writer as packed_writer
+from muvo_jax.data.plain import reader as plain_reader
+from muvo_jax.data.plain import writer as plain_writer
 
 FRAMES = 24
 # What lies where, in the tags of CARLA up to 0.9.13 and from 0.9.14 on.
@@ -198,12 +200,12 @@ def test_a_pack_keeps_the_scale_of_the_route_maps(tmp_path, text, expected):
 def test_an_export_says_the_weather_and_the_town_of_each_run(tmp_path):
     source = tmp_path / "source"
     camera = schema.Camera.level(64, 32, 1.5, (1.0, 0.0, 2.0))
-    recorder.write_description(source, name="CARLA", rate_hz=10, splits=("train", "val_rl"), camera=camera,
-                               lidar=muvo_reader.LIDAR, contract=muvo_reader.CONTRACT, classes=muvo_files.CLASSES,
-                               route_map=muvo_reader.ROUTE_MAP)
+    plain_writer.write_description(source, name="CARLA", rate_hz=10, splits=("train", "val_rl"), camera=camera,
+                                   lidar=muvo_reader.LIDAR, contract=muvo_reader.CONTRACT, classes=muvo_files.CLASSES,
+                                   route_map=muvo_reader.ROUTE_MAP)
     weathers = {"Town03_000": "WetNoon", "Town06_001": "ClearSunset", "mine": ""}
     for run, weather in weathers.items():
-        writer = recorder.RunWriter(source, "train", run)
+        writer = plain_writer.RunWriter(source, "train", run)
         for number in range(3):
             writer.write({"frame_id": number, "timestamp_s": number / 10, "speed_mps": 5.0, "acceleration": 0.1,
                           "steering": 0.0, "weather": weather, "image": np.full((32, 64, 3), number, np.uint8),
@@ -224,7 +226,7 @@ def test_an_export_says_the_weather_and_the_town_of_each_run(tmp_path):
 
 def test_drives_recorded_in_carla_name_their_classes_and_scale(tmp_path):
     carla_recorder._describe(tmp_path, carla_recorder.Settings())
-    header = plain.read_header(tmp_path)
+    header = plain_reader.read_header(tmp_path)
     assert tuple(header["classes"]) == muvo_files.CLASSES
     assert config_lib.parse(config_lib.RouteMap, header["route_map"], "route_map") == muvo_reader.ROUTE_MAP
     assert "vehicle" in header["classes"] and "pedestrian" in header["classes"]

@@ -11,9 +11,10 @@ from PIL import Image
 
 from muvo_jax import config as config_lib
 from muvo_jax import presets
-from muvo_jax.data import pipeline, prepare, recorder, schema, sources, windows
+from muvo_jax.data import pipeline, prepare, schema, sources, windows
 from muvo_jax.data.packed import reader as packed_reader
 from muvo_jax.data.packed import writer as packed_writer
+from muvo_jax.data.plain import writer as plain_writer
 
 GRID = config_lib.VoxelGrid(shape=(16, 16, 16), voxel_size_m=1.0, origin_m=(-8.0, -8.0, -2.0))
 STRIDE = 2
@@ -98,11 +99,12 @@ def test_windows_of_a_pack_pass_by_what_those_of_its_source_do(uneven, tmp_path)
 
 def test_moving_masks_labels_and_step_actions_survive(tmp_path):
     root, rng = tmp_path / "source", np.random.default_rng(0)
-    recorder.write_description(root, name="all", rate_hz=10, splits=("train",), voxels=GRID,
-                               camera=schema.Camera.level(64, 32, 1.5, (1.0, 0.0, 2.0)), contract=CONFIG.contract,
-                               lidar=config_lib.RangeViewGeometry(), classes=("sky", "road", "vehicle", "pedestrian"),
-                               route_map=config_lib.RouteMap(0.3, 50.0, 31.0))
-    writer = recorder.RunWriter(root, "train", "a")
+    plain_writer.write_description(root, name="all", rate_hz=10, splits=("train",), voxels=GRID,
+                                   camera=schema.Camera.level(64, 32, 1.5, (1.0, 0.0, 2.0)), contract=CONFIG.contract,
+                                   lidar=config_lib.RangeViewGeometry(),
+                                   classes=("sky", "road", "vehicle", "pedestrian"),
+                                   route_map=config_lib.RouteMap(0.3, 50.0, 31.0))
+    writer = plain_writer.RunWriter(root, "train", "a")
     for number in range(9):
         instances = rng.integers(0, 3, GRID.shape[:2])
         writer.write({

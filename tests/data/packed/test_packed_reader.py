@@ -21,10 +21,11 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from PIL import Image
 
-from muvo_jax.data import plain, schema, sources
+from muvo_jax.data import schema, sources
 from muvo_jax.data.packed import reader as packed_reader
 from muvo_jax.data.packed import records
 from muvo_jax.data.packed import writer as packed_writer
+from muvo_jax.data.plain import reader as plain_reader
 
 ROOT = pathlib.Path(__file__).parents[3]
 
@@ -53,7 +54,7 @@ def packed(source, tmp_path):
 
 
 def test_every_frame_and_the_description_come_back(source, packed):
-    before, after = plain.PlainRecording(source), sources.open_recording(packed)
+    before, after = plain_reader.PlainRecording(source), sources.open_recording(packed)
     assert isinstance(after, packed_reader.PackedRecording)
     assert after.sequences == before.sequences
     for name in ("camera", "lidar", "voxels", "contract", "modalities", "splits", "rate_hz", "name"):
@@ -122,7 +123,7 @@ def test_flipped_bytes_are_found(packed):
 
 
 def test_records_are_not_unpickled_and_lossy_ones_are_smaller(source):
-    frame = plain.PlainRecording(source).read(plain.PlainRecording(source).sequences[0], 0)
+    frame = plain_reader.PlainRecording(source).read(plain_reader.PlainRecording(source).sequences[0], 0)
     rng = np.random.default_rng(0)
     frame["image"] = rng.integers(0, 255, (32, 64, 3), np.uint8)
     frame["points_m"] = rng.uniform(-60, 60, (500, 3)).astype(np.float32)
@@ -164,7 +165,7 @@ def test_readers_are_bounded_and_closed(source, tmp_path, monkeypatch):
 def test_several_workers_write_what_one_writes(source, packed, tmp_path):
     progress = []
     assert packed_writer.pack(source, tmp_path / "two", frames_per_shard=5, workers=2,
-                       progress=lambda *counts: progress.append(counts))
+                              progress=lambda *counts: progress.append(counts))
     assert (tmp_path / "two/manifest.json").read_text() == (packed / "manifest.json").read_text()
     assert progress[-1] == (24, 24)
 

@@ -1,4 +1,4 @@
-"""Writes the plain recording format that plain.py reads: folders of PNG, NPZ, CSV and TOML, nothing pickled.
+"""Writes the plain recording format that reader.py reads: folders of PNG, NPZ, CSV and TOML, nothing pickled.
 
 A run counts once its frames.csv is there, and that is written last, by renaming: whatever interrupts a recording leaves
 either a complete run or one that readers ignore, and recording again goes on where it stopped. Depth maps (16-bit PNG,
@@ -9,22 +9,21 @@ from __future__ import annotations
 
 import csv
 import io
-import json
-import os
 import pathlib
 import shutil
-import zipfile
 from collections.abc import Mapping
 
 import numpy as np
 from PIL import Image
 
 from muvo_jax import config as config_lib
-from muvo_jax.data import description, fields, frames_table, plain, schema
+from muvo_jax.data import description, fields, files, schema
+from muvo_jax.data.plain import frames_table
+from muvo_jax.data.plain import reader as plain_reader
 
 COLUMNS = ("frame_id", "timestamp_s", "x_m", "y_m", "yaw_rad", "speed_mps", "acceleration", "steering", "reward",
            "is_terminal", "weather")
-DEPTH_UNIT_M, DEPTH_SKY = plain.DEPTH_UNIT_M, plain.DEPTH_SKY
+DEPTH_UNIT_M, DEPTH_SKY = plain_reader.DEPTH_UNIT_M, plain_reader.DEPTH_SKY
 _NO_FILE = fields.Field("", np.uint8)
 # Names of RawFrame and what recorders call them: both are taken.
 _ALIASES = {"classes": "image_classes", "point_tags": "point_classes"}
@@ -48,23 +47,24 @@ def write_description(root: pathlib.Path | str, *, name: str, rate_hz: float, sp
       FileExistsError: where ROOT holds a different description (runs of different settings must not be mixed).
     """
     root = pathlib.Path(root).expanduser()
-    text = to_toml({"schema_version": plain.SCHEMA_VERSION, "name": name, "rate_hz": float(rate_hz),
-                    "splits": list(splits)} | ({"classes": list(classes)} if classes else {}),
-                   description.tables(action=contract, camera=camera, lidar=lidar, voxels=voxels, route_map=route_map))
-    path = root / plain.DESCRIPTION_FILE
+    text = files.to_toml({"schema_version": plain_reader.SCHEMA_VERSION, "name": name, "rate_hz": float(rate_hz),
+                          "splits": list(splits)} | ({"classes": list(classes)} if classes else {}),
+                         description.tables(action=contract, camera=camera, lidar=lidar, voxels=voxels,
+                                            route_map=route_map))
+    path = root / plain_reader.DESCRIPTION_FILE
     if path.exists():
         if path.read_text(encoding="utf-8") != text:
             raise FileExistsError(f"{path} describes another recording (other sensors, splits or actions); choose "
                                   f"another folder or remove this one.")
         return path
     root.mkdir(parents=True, exist_ok=True)
-    write_atomically(path, text)
+    files.write_atomically(path, text)
     return path
 
 
 def is_complete(root: pathlib.Path | str, split: str, run: str) -> bool:
     """Whether a run was recorded to its end, so that it need not be recorded again."""
-    return (pathlib.Path(root).expanduser() / split / run / plain.FRAMES_FILE).is_file()
+    return (pathlib.Path(root).expanduser() / split / run / plain_reader.FRAMES_FILE).is_file()
 
 
 class RunWriter:
@@ -117,7 +117,7 @@ class RunWriter:
             else:
                 self._save_png(field.folder, frame_id, array)
         for folder, contents in packed.items():
-            self._path(folder, frame_id, ".npz").write_bytes(npz_bytes(contents))
+            self._path(folder, frame_id, ".npz").write_bytes(files.npz_bytes(contents))
         self._rows.append(row)
 
     def close(self) -> None:
@@ -127,7 +127,7 @@ class RunWriter:
         writer = csv.DictWriter(table, (*COLUMNS, *more), restval="", lineterminator="\n")
         writer.writeheader()
         writer.writerows(self._rows)
-        write_atomically(self.folder / plain.FRAMES_FILE, table.getvalue())
+        files.write_atomically(self.folder / plain_reader.FRAMES_FILE, table.getvalue())
 
     def _path(self, folder: str, frame_id: int, suffix: str) -> pathlib.Path:
         path = self.folder / folder / f"{frame_id:06d}{suffix}"
@@ -137,8 +137,8 @@ class RunWriter:
     def _write_depth(self, frame_id: int, depth_m: np.ndarray, *, exactly: bool) -> None:
         """As centimetres; where these would not give the same numbers again, and that is asked for, as they are."""
         centimetres = encode_depth(depth_m)
-        if exactly and not np.array_equal(plain.decode_depth(centimetres), depth_m):
-            self._path("depth", frame_id, ".npz").write_bytes(npz_bytes({"depth_m": depth_m}))
+        if exactly and not np.array_equal(plain_reader.decode_depth(centimetres), depth_m):
+            self._path("depth", frame_id, ".npz").write_bytes(files.npz_bytes({"depth_m": depth_m}))
         else:
             self._save_png("depth", frame_id, centimetres)
 
@@ -169,33 +169,6 @@ def encode_depth(depth_m: np.ndarray) -> np.ndarray:
     return np.minimum(centimetres, DEPTH_SKY).astype(np.uint16)
 
 
-def write_atomically(path: pathlib.Path, content: str | bytes) -> None:
-    """Writes a file such that it is there whole or not at all."""
-    draft = path.with_name(f".{path.name}.{os.getpid()}")
-    draft.write_bytes(content.encode() if isinstance(content, str) else content)
-    os.replace(draft, path)
-
-
-def to_toml(values: Mapping, tables: Mapping[str, Mapping]) -> str:
-    """Formats top-level values and one level of tables; strings, booleans, numbers and nested lists of them."""
-    lines = [f"{name} = {_toml_value(value)}" for name, value in values.items()]
-    for table, entries in tables.items():
-        lines += ["", f"[{table}]"] + [f"{name} = {_toml_value(value)}" for name, value in entries.items()]
-    return "\n".join(lines) + "\n"
-
-
-def _toml_value(value) -> str:
-    if isinstance(value, (list, tuple)):
-        return "[" + ", ".join(_toml_value(item) for item in value) + "]"
-    if isinstance(value, str):
-        return json.dumps(value, ensure_ascii=False)
-    if isinstance(value, (bool, np.bool_)):
-        return "true" if value else "false"
-    if isinstance(value, (float, np.floating)):
-        return repr(float(value))
-    return str(int(value))
-
-
 def _cell(value) -> str:
     """A field of frames.csv; numbers keep all their digits."""
     if isinstance(value, str):
@@ -205,19 +178,3 @@ def _cell(value) -> str:
     if isinstance(value, (int, np.integer)):
         return str(int(value))
     return str(value) if isinstance(value, np.floating) else repr(float(value))
-
-
-def npz_bytes(arrays: Mapping[str, np.ndarray]) -> bytes:
-    """An NPZ file, at the fastest compression: half the size of none, a third of the time of NumPy's.
-
-    The archive's time stamps are fixed, so that equal arrays give equal bytes.
-    """
-    content = io.BytesIO()
-    with zipfile.ZipFile(content, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
-        for name, array in arrays.items():
-            buffer = io.BytesIO()
-            np.lib.format.write_array(buffer, array, allow_pickle=False)
-            entry = zipfile.ZipInfo(f"{name}.npy")
-            entry.compress_type = zipfile.ZIP_DEFLATED
-            archive.writestr(entry, buffer.getbuffer(), compresslevel=1)
-    return content.getvalue()

@@ -5,7 +5,8 @@ import pytest
 import recording_writers as writers
 from PIL import Image
 
-from muvo_jax.data import plain, schema, sources
+from muvo_jax.data import schema, sources
+from muvo_jax.data.plain import reader as plain_reader
 
 
 def rewrite_table(root, run, change):
@@ -37,7 +38,7 @@ def test_a_run_without_table_is_left_out_with_a_warning(tmp_path):
     root = writers.write_plain(tmp_path)
     (root / "train/b/frames.csv").unlink()
     with pytest.warns(schema.DataWarning, match="1 of 2 runs have no frames.csv.* b"):
-        recording = plain.PlainRecording(root)
+        recording = plain_reader.PlainRecording(root)
     assert [s.name for s in recording.sequences] == ["train/a", "val_rl/c"]
 
 
@@ -48,7 +49,7 @@ def test_a_missing_file_splits_the_sequence(tmp_path, file):
     (root / "train/a" / file).unlink()
     message = f"1 of 10 frames are left out .*1 in {file.split('/')[0]}.* 2 gap-free"
     with pytest.warns(schema.DataWarning, match=message):
-        recording = plain.PlainRecording(root)
+        recording = plain_reader.PlainRecording(root)
     assert [(s.start, s.length) for s in recording.sequences if s.name == "train/a"] == [(0, 4), (5, 5)]
 
 
@@ -57,7 +58,7 @@ def test_a_restart_and_a_missing_line_split_the_sequence(tmp_path):
     rewrite_table(root, "train/a", lambda lines: [*lines[:4], lines[4].replace(",0,noon", ",1,noon"), *lines[5:]])
     rewrite_table(root, "val_rl/c", lambda lines: lines[:4] + lines[5:])
     with pytest.warns(schema.DataWarning, match=r"val_rl/c: time jumps .* at 1 of 7 frames; .* 2 gap-free"):
-        recording = plain.PlainRecording(root)
+        recording = plain_reader.PlainRecording(root)
     pieces = [(s.name, s.start, s.length) for s in recording.sequences]
     assert pieces == [("train/a", 0, 4), ("train/a", 4, 6), ("train/b", 0, 6), ("val_rl/c", 0, 3), ("val_rl/c", 3, 4)]
 
@@ -69,7 +70,7 @@ def test_absent_modalities_are_absent(tmp_path):
             path.unlink()
         (root / "train/a" / name).rmdir()
     rewrite_table(root, "train/a", lambda lines: [line.replace(",1.0,", ",,") for line in lines])
-    recording = plain.PlainRecording(root)
+    recording = plain_reader.PlainRecording(root)
     assert not {"route_map", "occupancy", "reward"} & recording.description.modalities
     assert not {"route_map", "occupancy", "reward"} & set(recording.read(recording.sequences[0], 0))
 
@@ -84,7 +85,7 @@ def test_absent_modalities_are_absent(tmp_path):
 ])
 def test_a_description_that_cannot_be_used(tmp_path, header, message):
     with pytest.raises(schema.DataError, match=message):
-        plain.PlainRecording(writers.write_plain(tmp_path, {"train/a": 2}, **header))
+        plain_reader.PlainRecording(writers.write_plain(tmp_path, {"train/a": 2}, **header))
 
 
 def test_how_windows_are_cut_is_no_matter_of_the_recording(tmp_path):
@@ -92,7 +93,7 @@ def test_how_windows_are_cut_is_no_matter_of_the_recording(tmp_path):
     assert "step_action" not in path.read_text()
     path.write_text(path.read_text().replace("[action]\n", '[action]\nstep_action = "first"\n'))
     with pytest.raises(schema.DataError, match=r"train with --set contract\.step_action=first"):
-        plain.PlainRecording(tmp_path)
+        plain_reader.PlainRecording(tmp_path)
 
 
 def test_a_missing_section_is_named(tmp_path):
@@ -100,7 +101,7 @@ def test_a_missing_section_is_named(tmp_path):
     text = (root / "recording.toml").read_text()
     (root / "recording.toml").write_text(text[:text.index("[voxels]")])
     with pytest.raises(schema.DataError, match=r"section \[voxels\] is missing"):
-        plain.PlainRecording(root)
+        plain_reader.PlainRecording(root)
 
 
 @pytest.mark.parametrize(("change", "message"), [
@@ -113,7 +114,7 @@ def test_a_table_that_cannot_be_used(tmp_path, change, message):
     root = writers.write_plain(tmp_path)
     rewrite_table(root, "train/a", change)
     with pytest.raises(schema.DataError, match=f"frames.csv.*{message}"):
-        plain.PlainRecording(root)
+        plain_reader.PlainRecording(root)
 
 
 def truncate(path):
@@ -133,7 +134,7 @@ def truncate(path):
 def test_a_file_that_cannot_be_read(tmp_path, file, damage, message):
     root = writers.write_plain(tmp_path)
     damage(root / "train/a" / file)
-    recording = plain.PlainRecording(root)
+    recording = plain_reader.PlainRecording(root)
     with pytest.raises(schema.DataError, match=message):
         recording.read(recording.sequences[0], 0)
 
@@ -141,7 +142,7 @@ def test_a_file_that_cannot_be_read(tmp_path, file, damage, message):
 def test_a_pickle_inside_an_npz_is_refused(tmp_path):
     root = writers.write_plain(tmp_path)
     np.savez(root / "train/a/lidar/000000.npz", points_m=np.array([{"a": 1}], dtype=object))
-    recording = plain.PlainRecording(root)
+    recording = plain_reader.PlainRecording(root)
     with pytest.raises(schema.DataError, match="not a readable NPZ"):
         recording.read(recording.sequences[0], 0)
 
@@ -164,7 +165,7 @@ def test_images_may_be_jpeg(tmp_path):
         path = root / f"train/a/image/{index:06d}.png"
         Image.open(path).save(path.with_suffix(suffix), quality=95)
         path.unlink()
-    recording = plain.PlainRecording(root)
+    recording = plain_reader.PlainRecording(root)
     assert recording.sequences[0].length == 10
     for index in (2, 3, 4):
         assert np.abs(recording.read(recording.sequences[0], index)["image"].astype(int) - index).max() <= 2

@@ -18,7 +18,7 @@ and, read only where a head learns from them,
     ROOT/<split>/<run>/lidar/000012.npz         also point_tags uint8 [N], the class of each point
     ROOT/<split>/<run>/birds_eye/000012.npz     birds_eye_classes uint8 and birds_eye_instances int32 [X, Y]
 
-fields.py is the table of all this; recorder.py writes it. Files may be named by the frame's number with any number of
+fields.py is the table of all this; writer.py writes it. Files may be named by the frame's number with any number of
 leading zeros, and in upper case.
 """
 
@@ -32,7 +32,8 @@ from typing import Any
 import numpy as np
 
 from muvo_jax import config as config_lib
-from muvo_jax.data import description, fields, files, frames_table, runs, schema
+from muvo_jax.data import description, fields, files, runs, schema, sequences
+from muvo_jax.data.plain import frames_table
 
 SCHEMA_VERSION = 1
 DESCRIPTION_FILE = "recording.toml"
@@ -223,17 +224,17 @@ class PlainRecording:
             there = self._files[run.name][folder].present
             present &= there
             absent[folder] = int((~there).sum())
-        late = files.after_gap(run.columns["timestamp_s"], period_s)
+        late = sequences.after_gap(run.columns["timestamp_s"], period_s)
         restarts = np.zeros(len(present), bool)
         if "is_terminal" in run.columns:
             restarts[1:] = run.columns["is_terminal"][:-1] > 0
-        pieces = files.gap_free(present, late | restarts)
-        files.warn_of_gaps(str(run.folder), present, absent, late & ~restarts, len(pieces))
+        pieces = sequences.gap_free(present, late | restarts)
+        sequences.warn_of_gaps(str(run.folder), present, absent, late & ~restarts, len(pieces))
         return [schema.Sequence(run.split, run.name, start, length, lacks) for start, length in pieces]
 
 
 def decode_depth(pixels: np.ndarray) -> np.ndarray:
-    """Centimetres (16 bit) to float32 metres, infinite in the sky; the inverse of recorder.encode_depth."""
+    """Centimetres (16 bit) to float32 metres, infinite in the sky; the inverse of writer.encode_depth."""
     return np.where(pixels == DEPTH_SKY, np.float32(np.inf), pixels.astype(np.float32) * np.float32(DEPTH_UNIT_M))
 
 

@@ -7,7 +7,9 @@ import pytest
 from PIL import Image
 
 from muvo_jax import config as config_lib
-from muvo_jax.data import plain, recorder, schema, sources
+from muvo_jax.data import files, schema, sources
+from muvo_jax.data.plain import reader as plain_reader
+from muvo_jax.data.plain import writer as plain_writer
 from muvo_jax.ops import camera as camera_ops
 
 GRID = config_lib.VoxelGrid(shape=(4, 5, 6), voxel_size_m=1.0, origin_m=(-2.0, -2.5, -1.0))
@@ -21,7 +23,7 @@ def describe(root, **changes):
     camera = schema.Camera(12, 8, tuple(map(tuple, intrinsics.tolist())), tuple(map(tuple, pose.tolist())))
     settings = {"name": 'a "test"', "rate_hz": 10.0, "splits": ("train", "val_rl"), "contract": CONTRACT,
                 "camera": camera, "lidar": LIDAR, "voxels": GRID, **changes}
-    return recorder.write_description(root, **settings)
+    return plain_writer.write_description(root, **settings)
 
 
 def make_frame(index, rng):
@@ -39,7 +41,7 @@ def make_frame(index, rng):
 def record(root, split="train", run="000", count=5, seed=0):
     rng = np.random.default_rng(seed)
     frames = [make_frame(index, rng) for index in range(count)]
-    writer = recorder.RunWriter(root, split, run)
+    writer = plain_writer.RunWriter(root, split, run)
     for frame in frames:
         writer.write(frame)
     writer.close()
@@ -66,7 +68,7 @@ def test_what_is_read_back_equals_what_was_written(tmp_path):
 def test_depth_and_classes_are_kept_beside_the_image(tmp_path):
     (frame,) = record(tmp_path, count=1)
     with Image.open(tmp_path / "train/000/depth/000000.png") as image:
-        depth_m = plain.decode_depth(np.asarray(image))
+        depth_m = plain_reader.decode_depth(np.asarray(image))
     assert np.isinf(depth_m[0]).all()
     np.testing.assert_allclose(depth_m[1:], frame["depth_m"][1:], atol=0.00501)
     with Image.open(tmp_path / "train/000/classes/000000.png") as image:
@@ -76,7 +78,7 @@ def test_depth_and_classes_are_kept_beside_the_image(tmp_path):
 def test_depth_code():
     """12.34 m is 1234; the largest code is the sky, and so is everything from 655.35 m on."""
     depth_m = np.array([0.0, 12.34, 655.34, 655.35, 1e9, np.inf, np.nan])
-    assert recorder.encode_depth(depth_m).tolist() == [0, 1234, 65534, 65535, 65535, 65535, 65535]
+    assert plain_writer.encode_depth(depth_m).tolist() == [0, 1234, 65534, 65535, 65535, 65535, 65535]
 
 
 def test_frames_csv_has_the_agreed_columns(tmp_path):
@@ -91,10 +93,10 @@ def test_frames_csv_has_the_agreed_columns(tmp_path):
 def test_an_unfinished_run_is_ignored_and_recorded_again(tmp_path):
     describe(tmp_path)
     record(tmp_path, run="000")
-    writer = recorder.RunWriter(tmp_path, "train", "001")
+    writer = plain_writer.RunWriter(tmp_path, "train", "001")
     writer.write(make_frame(0, np.random.default_rng(1)))  # and then the power fails
     writer.write(make_frame(1, np.random.default_rng(1)))
-    assert recorder.is_complete(tmp_path, "train", "000") and not recorder.is_complete(tmp_path, "train", "001")
+    assert plain_writer.is_complete(tmp_path, "train", "000") and not plain_writer.is_complete(tmp_path, "train", "001")
     with pytest.warns(schema.DataWarning, match="1 of 2 runs have no frames.csv"):
         assert len(sources.open_recording(tmp_path).sequences) == 1
 
@@ -106,7 +108,7 @@ def test_an_unfinished_run_is_ignored_and_recorded_again(tmp_path):
 def test_a_complete_run_is_not_overwritten(tmp_path):
     record(tmp_path)
     with pytest.raises(FileExistsError, match="recorded already"):
-        recorder.RunWriter(tmp_path, "train", "000")
+        plain_writer.RunWriter(tmp_path, "train", "000")
 
 
 def test_descriptions_of_other_settings_are_refused(tmp_path):
@@ -117,7 +119,7 @@ def test_descriptions_of_other_settings_are_refused(tmp_path):
 
 
 def test_frames_must_come_in_order(tmp_path):
-    writer = recorder.RunWriter(tmp_path, "train", "000")
+    writer = plain_writer.RunWriter(tmp_path, "train", "000")
     rng = np.random.default_rng(0)
     writer.write(make_frame(3, rng))
     with pytest.raises(ValueError, match="frame_id 3 after 3"):
@@ -126,7 +128,7 @@ def test_frames_must_come_in_order(tmp_path):
 
 def test_modalities_that_a_source_lacks_leave_no_trace(tmp_path):
     describe(tmp_path, camera=None, voxels=None)
-    writer = recorder.RunWriter(tmp_path, "train", "000")
+    writer = plain_writer.RunWriter(tmp_path, "train", "000")
     frame = make_frame(0, np.random.default_rng(0))
     writer.write({name: frame[name] for name in ("frame_id", "timestamp_s", "speed_mps", "acceleration", "steering",
                                                  "points_m")})
@@ -147,4 +149,4 @@ def test_equal_frames_give_equal_bytes(tmp_path):
 def test_toml_round_trip():
     values = {"text": 'quote " backslash \\ tab \t umlaut ü', "whole": 3, "real": 2.0, "tiny": 1e-30, "yes": True,
               "nested": [[1.0, 2.5], [0.0, -1.0]], "names": ["a", "b"]}
-    assert tomllib.loads(recorder.to_toml(values, {"table": values})) == {**values, "table": values}
+    assert tomllib.loads(files.to_toml(values, {"table": values})) == {**values, "table": values}

@@ -8,7 +8,7 @@ import pathlib
 
 import numpy as np
 
-from muvo_jax.data import fields, files, schema
+from muvo_jax.data import fields, schema, sequences
 
 FRAMES_FILE = "frames.csv"
 REQUIRED = tuple(column for column, field in fields.COLUMNS.items() if field.required)
@@ -34,7 +34,7 @@ def read(path: pathlib.Path) -> dict[str, np.ndarray]:
             where = [f"{path}, line {line}: {column}" for line in range(2, len(rows) + 2)]
             columns[column] = _frame_ids(cells, where) if column == "frame_id" else np.array(
                 [number(text, field, place) for text, place in zip(cells, where, strict=True)], np.float64)
-    files.check_increasing(columns["timestamp_s"], [f"{path}, line {line + 2}" for line in range(len(rows))])
+    sequences.check_increasing(columns["timestamp_s"], [f"{path}, line {line + 2}" for line in range(len(rows))])
     if "yaw_rad" in columns and "yaw_rate_radps" not in columns:
         columns["yaw_rate_radps"] = _rates(columns["yaw_rad"], columns["timestamp_s"])
     return columns

@@ -16,9 +16,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from muvo_jax.data import alignment as alignment_lib
-from muvo_jax.data import figures as figures_lib
-from muvo_jax.data import judgements, processes, schema, words
+from muvo_jax.data import processes, schema, words
+from muvo_jax.data.checkup import alignment as alignment_lib
+from muvo_jax.data.checkup import figures as figures_lib
+from muvo_jax.data.checkup import judgements
 
 STRETCH_FRAMES = 60
 _PICTURES = 16

@@ -1,4 +1,4 @@
-"""How a recording is judged: each function looks at one thing and returns findings in words (see checkup.py)."""
+"""How a recording is judged: each function looks at one thing and returns findings in words (see examination.py)."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from typing import Literal, NamedTuple
 import numpy as np
 
 from muvo_jax import config as config_lib
-from muvo_jax.data import alignment as alignment_lib
 from muvo_jax.data import schema, sequences
+from muvo_jax.data.checkup import alignment as alignment_lib
 
 # A window of the paper: 12 frames, every second recorded one.
 _WINDOW_FRAMES = 23

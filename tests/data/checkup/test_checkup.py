@@ -11,7 +11,8 @@ import recording_writers as writers
 import street_scene
 
 from muvo_jax import config as config_lib
-from muvo_jax.data import alignment, checkup, figures, judgements, kitti
+from muvo_jax.data import kitti
+from muvo_jax.data.checkup import alignment, examination, figures, judgements
 from muvo_jax.data.plain import reader as plain_reader
 from muvo_jax.ops import camera as camera_ops
 
@@ -164,7 +165,7 @@ def test_damaged_and_faulty_frames_are_counted(tmp_path):
     root = writers.write_plain(tmp_path / "rec")
     (root / "train/a/image/000004.png").write_bytes(b"")
     np.savez(root / "train/a/lidar/000005.npz", points_m=np.zeros((0, 3), np.float32))
-    result = checkup.examine(plain_reader.PlainRecording(root), ["a gap"], frames=0)
+    result = examination.examine(plain_reader.PlainRecording(root), ["a gap"], frames=0)
     texts = [finding.text for finding in result.findings if finding.level == "problem"]
     assert result.problems == len(texts)
     for part in ("a gap", "1 of 24 frames cannot be read: ", "000004.png", "1 of 23 scans are empty",
@@ -177,7 +178,7 @@ def test_damaged_and_faulty_frames_are_counted(tmp_path):
 def test_stretches_are_spread_and_limited(tmp_path):
     recording = plain_reader.PlainRecording(writers.write_plain(tmp_path / "rec", {"train/a": 200, "val/b": 5},
                                                                 splits='["train", "val"]'))
-    result = checkup.examine(recording, frames=120)
+    result = examination.examine(recording, frames=120)
     assert result.facts["read"] == "65 of 65 frames looked at"
     assert set(result.motion.stretch) == {0, 1}
 
@@ -208,7 +209,7 @@ def test_points_in_centimetres_are_found(tmp_path):
     root = writers.write_plain(tmp_path / "rec")
     for path in root.glob("*/*/lidar/*.npz"):
         np.savez(path, points_m=np.random.default_rng(0).uniform(-4000, 4000, (100, 3)).astype(np.float32))
-    texts = [finding.text for finding in checkup.examine(plain_reader.PlainRecording(root)).findings]
+    texts = [finding.text for finding in examination.examine(plain_reader.PlainRecording(root)).findings]
     assert any("are they in metres?" in text for text in texts)
 
 
@@ -227,4 +228,4 @@ def test_nothing_to_look_at_is_a_problem(tmp_path):
     described = plain_reader.PlainRecording(writers.write_plain(tmp_path / "rec")).description
     empty = types.SimpleNamespace(sequences=(), description=described)
     assert any("not one frame" in finding.text and finding.level == "problem"
-               for finding in checkup.examine(empty).findings)
+               for finding in examination.examine(empty).findings)

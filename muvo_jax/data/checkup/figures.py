@@ -1,4 +1,4 @@
-"""What the frames of a recording show one by one, counted: pictures, scans, voxels and labels (see checkup.py)."""
+"""What the frames of a recording show one by one, counted: pictures, scans, voxels and labels (see examination.py)."""
 
 from __future__ import annotations
 
@@ -7,8 +7,9 @@ import collections
 import numpy as np
 
 from muvo_jax import config as config_lib
-from muvo_jax.data import fields, judgements, schema
-from muvo_jax.data.judgements import Finding
+from muvo_jax.data import fields, schema
+from muvo_jax.data.checkup import judgements
+from muvo_jax.data.checkup.judgements import Finding
 from muvo_jax.ops import voxels
 
 _OCCUPANCY_VALUES = (voxels.EMPTY, voxels.OCCUPIED, voxels.UNKNOWN)

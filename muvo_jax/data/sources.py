@@ -6,7 +6,8 @@ import pathlib
 from collections.abc import Callable, Collection
 from typing import Any, NamedTuple
 
-from muvo_jax.data import files, kitti, schema
+from muvo_jax.data import files, schema
+from muvo_jax.data.kitti import reader as kitti_reader
 from muvo_jax.data.muvo import reader as muvo_reader
 from muvo_jax.data.muvo import runs as muvo_runs
 from muvo_jax.data.packed import manifest
@@ -41,7 +42,8 @@ KINDS = (
     Kind("plain", f"a folder with {plain_reader.DESCRIPTION_FILE}",
          lambda path: (path / plain_reader.DESCRIPTION_FILE).is_file(), plain_reader.PlainRecording),
     Kind("KITTI raw", "<date>/<date>_drive_NNNN_sync folders, or one of them",
-         lambda path: bool(kitti.find_drives(path)), kitti.KittiRecording, kitti.CAMERAS, options=("camera",)),
+         lambda path: bool(kitti_reader.find_drives(path)), kitti_reader.KittiRecording, kitti_reader.CAMERAS,
+         options=("camera",)),
     Kind("MUVO CARLA", f"trainval/<mode>/<Town>/<run> folders with {muvo_runs.FRAME_FILE}, or one of them",
          lambda path: bool(muvo_runs.folders(path)), muvo_reader.MuvoRecording),
 )

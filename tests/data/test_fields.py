@@ -11,7 +11,8 @@ from hypothesis.extra import numpy as arrays
 
 from muvo_jax import config as config_lib
 from muvo_jax import types
-from muvo_jax.data import fields, kitti, schema
+from muvo_jax.data import fields, schema
+from muvo_jax.data.kitti import reader as kitti_reader
 from muvo_jax.data.packed import reader as packed_reader
 from muvo_jax.data.packed import records
 from muvo_jax.data.packed import writer as packed_writer
@@ -118,7 +119,7 @@ def test_a_run_may_have_one_of_the_masks_that_share_a_file(tmp_path):
 
 
 def test_kitti_and_packs_are_copied_bit_for_bit(tmp_path):
-    sources_ = {"kitti": kitti.KittiRecording(writers.write_kitti(tmp_path / "kitti"))}
+    sources_ = {"kitti": kitti_reader.KittiRecording(writers.write_kitti(tmp_path / "kitti"))}
     packed_writer.pack(writers.write_plain(tmp_path / "plain"), tmp_path / "packed", workers=1)
     sources_["packed"] = packed_reader.PackedRecording(tmp_path / "packed")
     for name, source in sources_.items():

@@ -10,7 +10,8 @@ from PIL import Image
 
 from muvo_jax import config as config_lib
 from muvo_jax import presets
-from muvo_jax.data import fields, files, kitti, pipeline, prepare, schema, sources, windows
+from muvo_jax.data import fields, files, pipeline, prepare, schema, sources, windows
+from muvo_jax.data.kitti import reader as kitti_reader
 from muvo_jax.data.plain import reader as plain_reader
 from muvo_jax.data.plain import writer as plain_writer
 
@@ -341,7 +342,7 @@ def test_home_folders_are_expanded(tmp_path, monkeypatch):
     drive = writers.write_kitti(tmp_path / "kitti")
     assert sources.open_recording("~/rec").sequences
     assert plain_reader.PlainRecording("~/rec").sequences
-    assert kitti.KittiRecording(f"~/kitti/{drive.parent.name}").sequences
+    assert kitti_reader.KittiRecording(f"~/kitti/{drive.parent.name}").sequences
     plain_writer.RunWriter("~/mine", "train", "a").close()
     assert plain_writer.is_complete("~/mine", "train", "a") and (tmp_path / "mine/train/a/frames.csv").is_file()
 
@@ -380,11 +381,11 @@ def test_kitti_numbers_that_cannot_be_are_refused(tmp_path, name, change, messag
     drive = writers.write_kitti(tmp_path)
     kitti_bytes(drive, name, change)
     if message is None:
-        recording = kitti.KittiRecording(drive)
+        recording = kitti_reader.KittiRecording(drive)
         assert recording.read(recording.sequences[0], 0)["speed_mps"] == 10.0
         return
     with pytest.raises(schema.DataError, match=message):
-        recording = kitti.KittiRecording(drive)
+        recording = kitti_reader.KittiRecording(drive)
         recording.read(recording.sequences[0], 0)
 
 
@@ -395,7 +396,7 @@ def test_one_drive_with_more_takes_no_drive_away(tmp_path):
         shutil.copytree(drive, other)
         shutil.rmtree(other / "velodyne_points")
     with pytest.warns(schema.DataWarning, match="only 1 of 3 drives have velodyne_points: it is not used"):
-        recording = kitti.KittiRecording(tmp_path)
+        recording = kitti_reader.KittiRecording(tmp_path)
     assert len({sequence.name for sequence in recording.sequences}) == 3 and recording.description.lidar is None
 
 

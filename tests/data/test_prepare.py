@@ -9,13 +9,14 @@ import recording_writers as writers
 
 from muvo_jax import config as config_lib
 from muvo_jax import presets
-from muvo_jax.data import kitti, prepare, schema
+from muvo_jax.data import prepare, schema
+from muvo_jax.data.kitti import reader as kitti_reader
 from muvo_jax.data.plain import reader as plain_reader
 
 
 @pytest.fixture
 def kitti_recording(tmp_path):
-    return kitti.KittiRecording(writers.write_kitti(tmp_path, frames=24))
+    return kitti_reader.KittiRecording(writers.write_kitti(tmp_path, frames=24))
 
 
 @pytest.fixture
@@ -36,7 +37,7 @@ def test_kitti_gives_the_town_preset_its_sensors(kitti_recording):
     lidar = config.model.range_view
     preset = presets.get("town").model.range_view
     assert (lidar.rows, lidar.columns) == (preset.rows, preset.columns)
-    assert lidar.position_m == (0.0, 0.0, 1.73) and lidar.elevation_max_rad == kitti.LIDAR.elevation_max_rad
+    assert lidar.position_m == (0.0, 0.0, 1.73) and lidar.elevation_max_rad == kitti_reader.LIDAR.elevation_max_rad
     assert config.model.voxels == presets.get("town").model.voxels
     assert not config.model.route and config.model.speed
     assert config.contract.source == "derived"

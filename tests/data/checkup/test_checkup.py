@@ -11,8 +11,8 @@ import recording_writers as writers
 import street_scene
 
 from muvo_jax import config as config_lib
-from muvo_jax.data import kitti
 from muvo_jax.data.checkup import alignment, examination, figures, judgements
+from muvo_jax.data.kitti import reader as kitti_reader
 from muvo_jax.data.plain import reader as plain_reader
 from muvo_jax.ops import camera as camera_ops
 
@@ -136,14 +136,14 @@ def row_rad(lidar):
 @pytest.mark.parametrize("error_rad", [(0.0, 0.0), (0.05, 0.0), (-0.035, 0.03)])
 @pytest.mark.parametrize("keep_every", [1, 2, 4])
 def test_thinned_kitti_is_measured_within_a_row(keep_every, error_rad):
-    recording = kitti.KittiRecording(samples.KITTI)
+    recording = kitti_reader.KittiRecording(samples.KITTI)
     frames = [recording.read(sequence, index) for sequence in recording.sequences for index in range(0, 30, 5)
               if index < sequence.length]
-    thinned = dataclasses.replace(kitti.LIDAR, rows=64 // keep_every)
+    thinned = dataclasses.replace(kitti_reader.LIDAR, rows=64 // keep_every)
     for frame in frames:
-        relative_m = frame["points_m"] - np.array(kitti.LIDAR.position_m)
+        relative_m = frame["points_m"] - np.array(kitti_reader.LIDAR.position_m)
         elevation_rad = np.arctan2(relative_m[:, 2], np.hypot(relative_m[:, 0], relative_m[:, 1]))
-        image_row = ((kitti.LIDAR.elevation_max_rad - elevation_rad) / row_rad(kitti.LIDAR)).astype(int)
+        image_row = ((kitti_reader.LIDAR.elevation_max_rad - elevation_rad) / row_rad(kitti_reader.LIDAR)).astype(int)
         frame["points_m"] = frame["points_m"][image_row % keep_every == keep_every // 2]
         turned = street_scene.turn(-error_rad[0], error_rad[1]) @ frame["camera_to_ego"][:3, :3]
         frame["camera_to_ego"] = np.block([[turned, frame["camera_to_ego"][:3, 3:]], [np.eye(4)[3:]]])

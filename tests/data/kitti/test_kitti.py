@@ -13,7 +13,8 @@ from PIL import Image
 
 from muvo_jax import config as config_lib
 from muvo_jax import presets
-from muvo_jax.data import kitti, prepare, schema, sources
+from muvo_jax.data import prepare, schema, sources
+from muvo_jax.data.kitti import reader as kitti_reader
 from muvo_jax.ops import camera as camera_ops
 
 
@@ -30,7 +31,7 @@ def test_the_path_may_be_the_root_the_date_or_the_drive(drive):
 
 
 def test_two_thirds_train_and_the_rest_validates(drive):
-    recording = kitti.KittiRecording(drive)
+    recording = kitti_reader.KittiRecording(drive)
     assert [(s.split, s.start, s.length) for s in recording.sequences] == [("train", 0, 8), ("val", 8, 4)]
     assert recording.description.splits == ("train", "val")
     assert any("no domain-shift" in note for note in recording.description.notes)
@@ -38,7 +39,7 @@ def test_two_thirds_train_and_the_rest_validates(drive):
 
 
 def test_a_frame_in_the_ego_frame(drive):
-    recording = kitti.KittiRecording(drive)
+    recording = kitti_reader.KittiRecording(drive)
     frame = recording.read(recording.sequences[1], 1)
     assert frame["frame_id"] == 9
     assert frame["image"].shape == (48, 128, 3) and (frame["image"] == 90).all()
@@ -51,7 +52,7 @@ def test_a_frame_in_the_ego_frame(drive):
 
 
 def test_the_camera_sits_where_the_calibration_says(drive):
-    camera = kitti.KittiRecording(drive).description.camera
+    camera = kitti_reader.KittiRecording(drive).description.camera
     # 0.3 m ahead of and 0.08 m below a lidar at 1.73 m; a shift of 7 px at focal length 70 is 0.1 m to the left.
     np.testing.assert_allclose(np.array(camera.camera_to_ego)[:3, 3], [0.3, 0.1, 1.65], atol=1e-6)
     point_m = np.array([[10.3, 2.1, 0.65]], np.float32)  # 10 m ahead of, 2 m left of and 1 m below the camera
@@ -61,21 +62,21 @@ def test_the_camera_sits_where_the_calibration_says(drive):
 
 
 def test_actions_are_derived_from_the_motion(drive):
-    recording = kitti.KittiRecording(drive)
+    recording = kitti_reader.KittiRecording(drive)
     contract = recording.description.contract
     assert (contract.source, contract.kinematics, contract.wheelbase_m) == ("derived", "bicycle", 2.71)
     action = recording.read(recording.sequences[0], 0)["action"]
     np.testing.assert_array_equal(recording.action(recording.sequences[0], 0), action)
     # -1.2 m/s2 of 6 is a brake of 0.2; turning right (yaw rate -0.1 at 10 m/s) is steering to the right, > 0.
     np.testing.assert_allclose(action, [-0.2, math.atan(2.71 * 0.1 / 10) / 0.6], rtol=1e-6)
-    np.testing.assert_array_equal(kitti.derive_action(0.1, 99.0, 9.0, contract), [1.0, -1.0])
-    assert kitti.derive_action(5.0, 1.5, 0.0, contract)[0] == pytest.approx(0.5)
+    np.testing.assert_array_equal(kitti_reader.derive_action(0.1, 99.0, 9.0, contract), [1.0, -1.0])
+    assert kitti_reader.derive_action(5.0, 1.5, 0.0, contract)[0] == pytest.approx(0.5)
 
 
 def test_returns_of_the_own_car_are_left_out(drive):
     path = drive / "velodyne_points/data/0000000000.bin"
     np.array([[-0.9, 1.1, -0.5, 0], [5, 1, 0, 0]], np.float32).tofile(path)
-    np.testing.assert_allclose(kitti.read_scan(path), [[5, 1, 1.73]])
+    np.testing.assert_allclose(kitti_reader.read_scan(path), [[5, 1, 1.73]])
 
 
 @pytest.mark.parametrize("sensor", ["image_02/data/0000000004.png", "velodyne_points/data/0000000004.bin",
@@ -84,7 +85,7 @@ def test_a_missing_frame_splits_the_sequence_and_is_counted(drive, sensor):
     (drive / sensor).unlink()
     message = rf"1 of 12 frames are left out .*1 in {sensor.split('/')[0]}.* 3 gap-free"
     with pytest.warns(schema.DataWarning, match=message):
-        recording = kitti.KittiRecording(drive)
+        recording = kitti_reader.KittiRecording(drive)
     pieces = [(s.split, s.start, s.length) for s in recording.sequences]
     assert pieces == [("train", 0, 4), ("train", 5, 3), ("val", 8, 4)]
     assert recording.read(recording.sequences[1], 0)["frame_id"] == 5
@@ -96,7 +97,7 @@ def test_a_jump_in_time_splits_the_sequence(drive):
     late = [line.replace("13:02:25", "13:02:35").replace("13:02:26", "13:02:36") for line in lines[5:]]
     path.write_text("\n".join(lines[:5] + late))
     with pytest.warns(schema.DataWarning, match="time jumps by more than 1.5 periods at 1 of 12 frames"):
-        recording = kitti.KittiRecording(drive)
+        recording = kitti_reader.KittiRecording(drive)
     assert [(s.start, s.length) for s in recording.sequences] == [(0, 5), (5, 3), (8, 4)]
 
 
@@ -122,7 +123,7 @@ def test_a_sensor_may_be_missing_altogether(drive, absent, modality):
 def test_a_drive_without_image_and_scan_is_refused(drive):
     without(drive, "image_02", "velodyne_points")
     with pytest.raises(schema.DataError, match="no drive has frames of image_02"):
-        kitti.KittiRecording(drive)
+        kitti_reader.KittiRecording(drive)
 
 
 def test_every_camera_can_be_chosen(drive):
@@ -136,7 +137,7 @@ def test_every_camera_can_be_chosen(drive):
         lines += f"S_rect_{number}: 128 48\nP_rect_{number}: 70 0 64 {shift} 0 70 24 0 0 0 1 0\n"
     calibration.write_text(lines)
     places = []
-    for camera in kitti.CAMERAS:
+    for camera in kitti_reader.CAMERAS:
         recording = sources.open_recording(drive, camera=camera)
         frame = recording.read(recording.sequences[0], 3)
         assert frame["image"].shape == (48, 128, 3) and (frame["image"] == 30).all()
@@ -203,7 +204,7 @@ GOOD, BAD = (5.0, 1.0, 0.0, 0.0), (float("nan"), 1.0, 0.0, 0.0)
 def test_a_drive_that_cannot_be_opened(drive, damage, message):
     damage(drive)
     with pytest.raises(schema.DataError, match=message):
-        kitti.KittiRecording(drive)
+        kitti_reader.KittiRecording(drive)
 
 
 @pytest.mark.parametrize(("damage", "message"), [
@@ -218,7 +219,7 @@ def test_a_drive_that_cannot_be_opened(drive, damage, message):
 ])
 def test_a_frame_that_cannot_be_read(drive, damage, message):
     damage(drive)
-    recording = kitti.KittiRecording(drive)
+    recording = kitti_reader.KittiRecording(drive)
     with pytest.raises(schema.DataError, match=message):
         recording.read(recording.sequences[0], 0)
 
@@ -227,12 +228,12 @@ def test_a_few_nan_points_are_dropped_and_counted(drive):
     path = drive / "velodyne_points/data/0000000000.bin"
     path.write_bytes(points(*[GOOD] * 199, BAD)(None))
     with pytest.warns(schema.DataWarning, match="0000000000.bin: 1 of 200 points"):
-        assert kitti.read_scan(path).shape == (199, 3)
+        assert kitti_reader.read_scan(path).shape == (199, 3)
 
 
 def real_excerpt() -> pathlib.Path | None:
     """MUVO_KITTI, or a kitti_raw folder beside the repository."""
-    repository = pathlib.Path(__file__).parents[2]
+    repository = pathlib.Path(__file__).parents[3]
     candidates = [os.environ.get("MUVO_KITTI"), *repository.parent.glob("*/data/kitti_raw")]
     return next((pathlib.Path(path) for path in candidates if path and pathlib.Path(path).is_dir()), None)
 

@@ -26,7 +26,7 @@ import numpy as np
 
 from muvo_jax import config as config_lib
 from muvo_jax.data import files, schema, sequences
-from muvo_jax.data.kitti_files import LIDAR_HEIGHT_M, read_camera, read_oxts, read_pose, read_scan, text_lines
+from muvo_jax.data.kitti.files import LIDAR_HEIGHT_M, read_camera, read_oxts, read_pose, read_scan, text_lines
 
 __all__ = ["CAMERAS", "CONTRACT", "LIDAR", "LIDAR_HEIGHT_M", "KittiRecording", "derive_action", "find_drives",
            "read_camera", "read_oxts", "read_pose", "read_scan"]

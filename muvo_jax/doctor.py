@@ -16,7 +16,7 @@ from muvo_jax import command_line, late
 with late.imports():
     from muvo_jax import config as config_lib
     from muvo_jax import presets
-    from muvo_jax.data import prepare, schema, sequences, sources, words
+    from muvo_jax.data import fitting, prepare, schema, sequences, sources, words
     from muvo_jax.data.checkup import examination, judgements
     from muvo_jax.ops import voxels as voxel_ops
     from muvo_jax.training import screen
@@ -95,8 +95,8 @@ def open_recording(path: pathlib.Path, camera: str = "") -> tuple[schema.Recordi
 def refusals(recording: schema.Recording, result: examination.Checkup) -> list[str]:
     """Why training would not take the recording as it is; empty where it would."""
     try:
-        config = prepare.adapt(presets.get("town"), recording).config
-        prepare.check_targets(config, recording.description)
+        config = fitting.adapt(presets.get("town"), recording).config
+        fitting.check_targets(config, recording.description)
         for sample in result.pictures:
             prepare.prepare_frame(sample.frame, config)
     except ValueError as error:  # DataError too

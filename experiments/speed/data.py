@@ -24,7 +24,7 @@ from PIL import Image
 
 from muvo_jax import config as config_lib
 from muvo_jax import presets
-from muvo_jax.data import pipeline, prepare, schema, sources
+from muvo_jax.data import fitting, pipeline, prepare, schema, sources
 from muvo_jax.data.packed import manifest, records
 from muvo_jax.data.packed import writer as packed_writer
 from muvo_jax.data.plain import writer as plain_writer
@@ -151,7 +151,7 @@ def windows_from_folder(recording: schema.Recording) -> str:
     """Training windows of 6 frames at the paper's size by the clock, and where a frame's processor time goes."""
     chosen = {"data.cache_gib": 0.0, "data.frames": 6, "data.context": 2, "data.horizon": 2, "data.stride": 1}
     wanted = config_lib.override_all(presets.get("paper-occupancy"), chosen)
-    config = prepare.adapt(wanted, recording, keep=chosen).config
+    config = fitting.adapt(wanted, recording, keep=chosen).config
     frames = pipeline.Frames(recording, config)
     batches = pipeline.train_batches(frames, seed=0, batch=1)
     for _ in range(2 * pipeline.default_workers() + 4):  # what was read ahead

@@ -35,7 +35,7 @@ class Frames:
     """
 
     def __init__(self, recording: schema.Recording, config: config_lib.Config):
-        """`config` must be adapted to the recording (prepare.adapt)."""
+        """`config` must be adapted to the recording (fitting.adapt)."""
         self.recording = recording
         self.config = config
         self.cache = windows_lib.FrameCache(int(config.data.cache_gib * 2**30))

@@ -10,7 +10,7 @@ from PIL import Image
 
 from muvo_jax import config as config_lib
 from muvo_jax import presets
-from muvo_jax.data import fields, files, pipeline, prepare, schema, sources, windows
+from muvo_jax.data import fields, files, fitting, pipeline, prepare, schema, sources, windows
 from muvo_jax.data.kitti import reader as kitti_reader
 from muvo_jax.data.plain import reader as plain_reader
 from muvo_jax.data.plain import writer as plain_writer
@@ -219,8 +219,8 @@ def test_a_run_without_a_sensor_is_passed_by_only_where_it_is_needed(tmp_path, e
     assert [sequence.lacks for sequence in recording.sequences] == [(), ("points_m",), (), ()]
     assert "points_m" not in recording.read(recording.sequences[1], 0)
     config = config_lib.override_all(presets.tiny(), {"data.stride": 1})
-    adapted = prepare.adapt(config, recording).config
-    blind = prepare.adapt(config_lib.override_all(config, {"model.lidar": "none", "model.heads": ["image", "action"]}),
+    adapted = fitting.adapt(config, recording).config
+    blind = fitting.adapt(config_lib.override_all(config, {"model.lidar": "none", "model.heads": ["image", "action"]}),
                           recording).config
     names = {}
     for what, chosen in (("both", adapted), ("camera alone", blind)):
@@ -238,7 +238,7 @@ def test_a_split_that_lacks_what_is_needed_is_said_so(tmp_path):
         recording = plain_reader.PlainRecording(root)
     config = config_lib.override_all(presets.tiny(), {"data.stride": 1})
     with pytest.raises(schema.DataError, match=r"split 'val_rl' that has image has 0 frames, but a window needs 8"):
-        prepare.adapt(config, recording)
+        fitting.adapt(config, recording)
 
 
 @pytest.mark.parametrize("column", ["reward", "is_terminal", "x_m"])
@@ -256,7 +256,7 @@ def test_a_column_that_one_run_lacks_is_not_switched_off_for_the_others(tmp_path
     frame = recording.read(recording.sequences[2], 0)
     assert recording.sequences[2].name == "train/b" and (field in frame) == (column == "is_terminal")
     config = config_lib.override_all(presets.tiny(), {"data.stride": 1})
-    frames = pipeline.Frames(recording, prepare.adapt(config, recording).config)
+    frames = pipeline.Frames(recording, fitting.adapt(config, recording).config)
     batch = frames.batch([windows.Window(sequence, 0, 4, 1) for sequence in recording.sequences[1:4]])
     assert (batch.reward is None) == (column == "reward") and batch.is_terminal is not None
 
@@ -319,7 +319,7 @@ def test_route_maps_have_the_scale_that_the_recording_says(tmp_path):
     assert plain_reader.PlainRecording(root).description.route_map == config_lib.RouteMap()
     with (root / "recording.toml").open("a") as file:
         file.write("[route_map]\nmetres_per_px = 0.5\nego_row = 60\n")
-    config = prepare.adapt(presets.tiny(), plain_reader.PlainRecording(root)).config
+    config = fitting.adapt(presets.tiny(), plain_reader.PlainRecording(root)).config
     assert config.data.route_map == config_lib.RouteMap(0.5, 60.0, 32.0)
 
 
@@ -402,7 +402,7 @@ def test_one_drive_with_more_takes_no_drive_away(tmp_path):
 
 def test_frames_without_what_the_model_needs_are_refused_by_name(tmp_path):
     recording = plain_reader.PlainRecording(writers.write_plain(tmp_path, {"train/a": 30, "val_rl/b": 30}))
-    config = prepare.adapt(presets.tiny(), recording).config
+    config = fitting.adapt(presets.tiny(), recording).config
     frame = recording.read(recording.sequences[0], 0)
     del frame["points_m"]
     with pytest.raises(schema.DataError, match="frame 0 has no points_m, which the model needs"):

@@ -7,7 +7,7 @@ import pytest
 import recording_samples as samples
 
 from muvo_jax import presets
-from muvo_jax.data import pipeline, prepare, schema
+from muvo_jax.data import fitting, pipeline, prepare, schema
 from muvo_jax.data.muvo import reader as muvo_reader
 from muvo_jax.data.plain import reader as plain_reader
 from muvo_jax.ops import camera, range_view
@@ -31,8 +31,8 @@ def recording(tmp_path_factory):
 
 
 def test_the_town_teaches_every_optional_head(recording):
-    prepare.check_targets(CONFIG, recording.description)
-    model = prepare.adapt(dataclasses.replace(CONFIG, data=dataclasses.replace(CONFIG.data, stride=1)), recording)
+    fitting.check_targets(CONFIG, recording.description)
+    model = fitting.adapt(dataclasses.replace(CONFIG, data=dataclasses.replace(CONFIG.data, stride=1)), recording)
     assert model.config.model.semantic_classes == len(boxes.CLASSES) == CONFIG.model.semantic_classes
     batch = pipeline.Frames(recording, model.config).batch([pipeline.windows_lib.Window(
         recording.sequences[0], 0, 2, 1)])
@@ -55,7 +55,7 @@ def test_the_town_teaches_every_optional_head(recording):
 
 
 def test_scores_are_told_where_road_users_move_and_training_is_not(recording):
-    config = prepare.adapt(dataclasses.replace(CONFIG, data=dataclasses.replace(CONFIG.data, stride=1)),
+    config = fitting.adapt(dataclasses.replace(CONFIG, data=dataclasses.replace(CONFIG.data, stride=1)),
                            recording).config
     frames, window = pipeline.Frames(recording, config), pipeline.windows_lib.Window(recording.sequences[0], 0, 2, 1)
     assert not {name for name, value in vars(frames.batch([window])).items() if value is not None and "moving" in name}
@@ -80,9 +80,9 @@ def test_labels_are_read_only_where_asked_for(recording):
     usual = plain_reader.PlainRecording(next(iter(recording._runs.values())).folder.parents[1])
     assert not schema.LABELS & usual.read(usual.sequences[0], 0).keys()
     with pytest.raises(schema.DataError, match="head 'depth' learns from depth_m"):
-        prepare.check_targets(dataclasses.replace(CONFIG, loss=presets.tiny().loss), usual.description)
+        fitting.check_targets(dataclasses.replace(CONFIG, loss=presets.tiny().loss), usual.description)
     with pytest.raises(schema.DataError, match=r"loss\.image_instance is on and learns from image_instance_mask"):
-        prepare.check_targets(CONFIG, usual.description)
+        fitting.check_targets(CONFIG, usual.description)
 
 
 def test_another_head_does_not_rename_the_recording():

@@ -13,7 +13,7 @@ from PIL import Image
 
 from muvo_jax import config as config_lib
 from muvo_jax import presets
-from muvo_jax.data import prepare, schema, sources
+from muvo_jax.data import fitting, prepare, schema, sources
 from muvo_jax.data.kitti import reader as kitti_reader
 from muvo_jax.ops import camera as camera_ops
 
@@ -115,7 +115,7 @@ def test_a_sensor_may_be_missing_altogether(drive, absent, modality):
     assert modality not in recording.read(recording.sequences[0], 0)
     assert (recording.description.lidar is None) == (absent == "velodyne_points")
     assert (recording.description.camera is None) == (absent == "image_02")
-    model = prepare.adapt(config_lib.override(presets.get("tiny"), "data.stride", 1), recording).config.model
+    model = fitting.adapt(config_lib.override(presets.get("tiny"), "data.stride", 1), recording).config.model
     assert (model.camera == "none", model.lidar == "none") == (absent == "image_02", absent == "velodyne_points")
     assert model.heads == (("range_view", "occupancy", "action") if model.camera == "none" else ("image", "action"))
 
@@ -243,7 +243,7 @@ def test_a_real_drive():
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         recording = sources.open_recording(real_excerpt())
-    config, _ = prepare.adapt(presets.get("town"), recording)
+    config, _ = fitting.adapt(presets.get("town"), recording)
     frame = prepare.prepare_frame(recording.read(recording.sequences[0], 0), config)
     camera_position_m = np.array(recording.description.camera.camera_to_ego)[:3, 3]
     np.testing.assert_allclose(camera_position_m, [0.27, 0.06, 1.65], atol=0.03)  # KITTI's own drawing of the car

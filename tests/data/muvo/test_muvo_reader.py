@@ -7,7 +7,7 @@ import pytest
 import recording_samples as samples
 
 from muvo_jax import presets
-from muvo_jax.data import prepare, schema, sources
+from muvo_jax.data import fitting, schema, sources
 from muvo_jax.data.muvo import files as muvo_files
 from muvo_jax.data.muvo import reader as muvo_reader
 from muvo_jax.data.muvo import runs as muvo_runs
@@ -98,7 +98,7 @@ def test_other_sensors_are_described_beside_the_data(layout):
     ours = frame["points_m"]
     assert np.isclose(ours[:, 0].max(), default[:, 0].max() - 1.0) and np.isclose(ours[:, 1].max(),
                                                                                  default[:, 1].max() + 0.5)
-    config = prepare.adapt(presets.get("tiny"), recording).config
+    config = fitting.adapt(presets.get("tiny"), recording).config
     assert config.model.range_view.elevation_min_rad == -0.3
     assert config.model.range_view.position_m == (0.0, 0.5, 1.8)
 

@@ -11,7 +11,7 @@ from PIL import Image
 
 from muvo_jax import config as config_lib
 from muvo_jax import presets
-from muvo_jax.data import pipeline, prepare, schema, sources, windows
+from muvo_jax.data import fitting, pipeline, schema, sources, windows
 from muvo_jax.data.packed import reader as packed_reader
 from muvo_jax.data.packed import writer as packed_writer
 from muvo_jax.data.plain import writer as plain_writer
@@ -45,7 +45,7 @@ def assert_equal(source, packed):
 def batch_of(recording, split, heads=()):
     """The longest window of each sequence of the split that training would use, as evaluation sees it."""
     changes = {"model.heads": [*CONFIG.model.heads, *heads]} if heads else {}
-    config = prepare.adapt(config_lib.override_all(CONFIG, changes), recording).config
+    config = fitting.adapt(config_lib.override_all(CONFIG, changes), recording).config
     frames = pipeline.Frames(recording, config)
     found = windows.find_windows(recording, split, frames=4, stride=STRIDE, needs=frames.needs)
     firsts = {window.sequence.name: window for window in reversed(found)}

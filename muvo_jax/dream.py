@@ -112,7 +112,7 @@ def choose_window(recording: schema.Recording, config: config_lib.Config, option
         raise ValueError(f"--sequence: split {split!r} has no {options.sequence!r}; it has {known}.")
     sequence = max(named, key=lambda candidate: candidate.length)
     frames = data.context + data.horizon
-    last = sequence.length - prepare_lib.span(frames, data.stride)
+    last = sequence.length - windows.span(frames, data.stride)
     start = max(last, 0) // 2 if options.start is None else options.start
     if not 0 <= start <= last:
         raise ValueError(f"--start {start}: sequence {sequence.name!r} has {sequence.length} frames; {frames} frames, "

@@ -25,9 +25,9 @@ with late.imports():
     from muvo_jax import run as run_lib
     from muvo_jax.agents import closed_loop, environment, planners, rewards, sensitivity
     from muvo_jax.data import prepare, words
-    from muvo_jax.data.town import record, settings, simulator
     from muvo_jax.metrics import protocol, warp
     from muvo_jax.model import rollout
+    from muvo_jax.town import record, settings, simulator
     from muvo_jax.training import checkpoint_meta, screen
     from muvo_jax.viz import canvas, sheets
 

@@ -142,7 +142,7 @@ class Frames:
 
     Attributes:
       field: of types.Batch, what was recorded.
-      of: predictions [..., *size, channels] -> frames as that field has them; runs under jit.
+      of: (predictions [..., *size, channels], config) -> frames as that field has them; runs under jit.
       sums: from judged frames to sums that add over windows: name -> {part: float64 [B, T]}.
       metrics: name -> Metric.
       error: (frames, truth, grid) -> the error of each frame, float64 [B, T], by which the answer to actions is
@@ -152,7 +152,7 @@ class Frames:
     """
 
     field: str
-    of: Callable[[types.Array], types.Array]
+    of: Callable[[types.Array, ModelConfig], types.Array]
     sums: Callable[[Judged], Mapping[str, NamedSums]]
     metrics: Mapping[str, Metric]
     error: Callable[[np.ndarray, types.Batch, VoxelGrid], np.ndarray] | None = None

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from muvo_jax import head, types
-from muvo_jax.config import BIRDS_EYE_CLASSES, LossConfig
+from muvo_jax.config import BIRDS_EYE_CLASSES, LossConfig, ModelConfig
 from muvo_jax.metrics import maps, streaming
 from muvo_jax.model import decoders
 from muvo_jax.objectives import classification, instances, labels
@@ -30,7 +30,8 @@ def _weights(loss: LossConfig) -> dict[str, float]:
         f"birds_eye_offset_{scale}": loss.birds_eye_offset for scale in head.SCALES}
 
 
-def _classes(value: types.Array) -> types.Array:
+def _classes(value: types.Array, model: ModelConfig) -> types.Array:
+    del model
     return jnp.argmax(value[..., :BIRDS_EYE_CLASSES], axis=-1).astype(jnp.uint8)
 
 

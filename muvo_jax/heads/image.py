@@ -67,7 +67,7 @@ HEAD = head.Head(
     build=lambda model: decoders.of_image(model, 3), scales=head.SCALES, tokens="image", initial_bias=0.5,
     losses=_losses, weights=_weights, average=_average,
     frames=head.Frames(
-        field="image", of=lambda value: jnp.clip(value, 0.0, 1.0), sums=_sums, error=_error, error_name="image",
+        field="image", of=lambda value, model: jnp.clip(value, 0.0, 1.0), sums=_sums, error=_error, error_name="image",
         metrics={"psnr_db": head.Metric("frames", streaming.mean, "PSNR", "dB", 2, on_screen=True, by_step=True,
                                         logged="imagined_psnr_db", error=lambda decibels: 10.0 ** (-decibels / 10.0)),
                  "psnr_movers_db": head.Metric("movers", image.masked_psnr_db, "PSNR of movers", "dB", 2)},

@@ -37,7 +37,7 @@ DEPTH = head.Head(
     finish=lambda value, scale, config: value * config.range_scale_m,
     losses=_depth_losses, weights=lambda loss: head.scaled(loss, "depth"),
     frames=head.Frames(
-        field="depth_m", of=lambda value: value[..., 0], sums=_depth_sums,
+        field="depth_m", of=lambda value, model: value[..., 0], sums=_depth_sums,
         metrics={"depth_error_m": head.Metric("frames", streaming.mean, "depth error", "m", 2, higher=False,
                                               on_screen=True)},
         pictures=(head.Picture("depth", _draw_depth, legend=("range",)),)))
@@ -67,7 +67,8 @@ def _semantic(name: str, field: str, size: Callable[[ModelConfig], tuple[int, ..
             pictures=(head.Picture(name.replace("_", " "), _draw_classes),)))
 
 
-def _most_likely(logits: types.Array) -> types.Array:
+def _most_likely(logits: types.Array, model: ModelConfig) -> types.Array:
+    del model
     return jnp.argmax(logits, axis=-1).astype(jnp.uint8)
 
 

@@ -98,7 +98,8 @@ HEAD = head.Head(
     build=lambda model: decoders.of_voxels(model, 2), scales=head.SCALES, tokens="occupancy", initial_bias=0.0,
     losses=_losses, weights=_weights, average=_average,
     frames=head.Frames(
-        field="occupancy", of=occupancy.predicted_occupied, sums=_sums, metrics=_METRICS, error=_error,
-        error_name="voxels above the road",
+        field="occupancy", sums=_sums,
+        of=lambda value, model: occupancy.predicted_occupied(value, model.occupied_above),
+        metrics=_METRICS, error=_error, error_name="voxels above the road",
         pictures=(head.Picture("voxels above", _draw_above, "above", ("height", "unknown")),
                   head.Picture("voxels ahead", _draw_ahead, "ahead", ("height", "unknown")))))

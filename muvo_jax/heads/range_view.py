@@ -74,7 +74,7 @@ HEAD = head.Head(
     build=lambda model: decoders.of_range_view(model, 4), scales=head.SCALES, tokens="range_view", finish=_finish,
     initial_bias=0.0, losses=_losses, weights=_weights, average=_average,
     frames=head.Frames(
-        field="range_view", of=lambda value: value, sums=_sums, error=_error, error_name="range",
+        field="range_view", of=lambda value, model: value, sums=_sums, error=_error, error_name="range",
         metrics={"chamfer_m": head.Metric("all", streaming.mean, "Chamfer", "m", 3, higher=False, on_screen=True,
                                           by_step=True, logged="imagined_chamfer_m", error=lambda metres: metres),
                  "chamfer_above_m": head.Metric("above", streaming.mean, "Chamfer above the road", "m", 3,

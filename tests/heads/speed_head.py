@@ -32,7 +32,7 @@ HEAD = head.Head(
     finish=lambda value, scale, config: value * config.speed_scale_mps,
     losses=losses, weights=lambda loss: {"speed": 0.5},
     frames=head.Frames(
-        field="speed_mps", of=lambda value: value[..., 0], sums=sums, error=off_mps, error_name="speed",
+        field="speed_mps", of=lambda value, model: value[..., 0], sums=sums, error=off_mps, error_name="speed",
         metrics={"speed_error_mps": head.Metric("frames", streaming.mean, "speed error", "m/s", 2, higher=False,
                                                 on_screen=True, logged="imagined_speed_error_mps")},
         pictures=(head.Picture("speed", draw),)))

@@ -48,10 +48,10 @@ def test_a_weight_is_that_of_the_config_over_the_scale():
 def test_decoded_maps_become_what_a_recording_holds():
     logits = np.zeros((1, 1, 2, 2, 11), np.float32)
     logits[0, 0, 1, 0, 5], logits[..., 10] = 3.0, 9.0  # a centre is no class
-    classes = head_lib.shown(("birds_eye",))["birds_eye"].of(logits)
+    classes = head_lib.shown(("birds_eye",))["birds_eye"].of(logits, MODEL)
     assert classes.dtype == np.uint8
     np.testing.assert_array_equal(classes[0, 0], [[0, 0], [5, 0]])
-    assert head_lib.shown(("depth",))["depth"].of(np.full((1, 1, 2, 2, 1), 7.0)).shape == (1, 1, 2, 2)
+    assert head_lib.shown(("depth",))["depth"].of(np.full((1, 1, 2, 2, 1), 7.0), MODEL).shape == (1, 1, 2, 2)
 
 
 def test_settings_of_one_term_alone_ask_for_its_field():

@@ -160,6 +160,34 @@ class Frames:
     pictures: tuple[Picture, ...] = ()
 
 
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Guide:
+    """How a head's decoder sees the memory (model/guided.py, docs/memory.md).
+
+    Attributes:
+      view: whose memory it looks at, "image", "range_view" or "occupancy"; its Glimpse of model/glimpse.py.
+      plane: config -> full size; the ground plan of voxels, whose heights are channels.
+      width: config -> channels of the decoder.
+      channels: (config, scale) -> channels that it draws at a scale.
+      shrink: sides of the deepest map are those of the plane over this, where a vector is unfolded to it.
+      see: (glimpse, config) -> what the memory shows, as input channels [N, *plane, C].
+      compose: (drawn, glimpse, average, config) -> {scale: output}: what is drawn, put upon what the memory shows and
+        upon the average frame, which `average` adds to outputs {scale: [N, *plane / scale, channels]}.
+      blurs: whether what is seen reaches what is drawn by a linear path too. What is uncertain of an image is best
+        blurred, a linear function, and learned soonest as one. (Ranges are not: such a path moved every return a
+        little.)
+    """
+
+    view: str
+    plane: Callable[[ModelConfig], tuple[int, int]]
+    width: Callable[[ModelConfig], int]
+    channels: Callable[[ModelConfig, int], int]
+    shrink: int
+    see: Callable[[Any, ModelConfig], types.Array]
+    compose: Callable[[dict[int, types.Array], Any, Any, ModelConfig], dict[int, types.Array]]
+    blurs: bool = False
+
+
 def as_drawn(value: types.Array, scale: int, config: ModelConfig) -> types.Array:
     """`Head.finish` of a network whose outputs are predictions as they are."""
     del scale, config
@@ -182,6 +210,7 @@ class Head:
       initial_bias: bias of the last layers "head_SCALE" of a fresh model, the network's first guess.
       average: (metrics.baselines.TrainingMean, config) -> {scale: the average training frame in units of the outputs},
         which decoders start from (ModelConfig.first_guess); None where they start from zero.
+      guide: how its decoder sees the memory (first_guess="last_seen"); None for one that does not.
       term_targets: Batch field -> the term that reads it beside the targets.
       frames: how it is judged and drawn; None for what is neither.
     """
@@ -195,6 +224,7 @@ class Head:
     finish: Callable[[types.Array, int, ModelConfig], types.Array] = as_drawn
     initial_bias: float | None = None
     average: Callable[[Any, ModelConfig], Mapping[int, np.ndarray]] | None = None
+    guide: Guide | None = None
     term_targets: Mapping[str, TermTarget] = dataclasses.field(default_factory=dict)
     frames: Frames | None = None
 

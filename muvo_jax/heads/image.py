@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
 from muvo_jax import head, types
 from muvo_jax.config import LossConfig, ModelConfig, VoxelGrid
 from muvo_jax.metrics import baselines, image, streaming
-from muvo_jax.model import decoders
+from muvo_jax.model import decoders, glimpse, tokens
 from muvo_jax.objectives import labels, regression, similarity
+from muvo_jax.ops import resample
 
 
 def _losses(learned: head.Learned) -> dict[str, head.Sums]:
@@ -61,11 +63,33 @@ def _draw(frame: np.ndarray, scene, columns_px: int) -> np.ndarray:
     return canvas.resize(panels.camera(frame), columns_px)
 
 
+def _see(seen: glimpse.ImageGlimpse, config: ModelConfig) -> types.Array:
+    del config
+    return jnp.concatenate([seen.image - 0.5 * seen.covered, seen.covered], axis=-1)
+
+
+def _compose(raw, seen: glimpse.ImageGlimpse, mean, config: ModelConfig) -> dict[int, types.Array]:
+    """The average frame is put in the light of the newest image: at night it would fill every turn with daylight."""
+    del config
+    drawn, average = raw, mean(jax.tree.map(jnp.zeros_like, raw))
+    usual = average[1].mean(axis=(1, 2), keepdims=True)
+    light = jnp.where((seen.colour > 0.0) & (usual > 0.0), seen.colour / jnp.where(usual > 0.0, usual, 1.0), 1.0)
+    moved, covered, result = seen.image, seen.covered, {}
+    for scale in head.SCALES:
+        if scale > 1:
+            moved, covered = resample.mean_pool2(moved), resample.mean_pool2(covered)
+        result[scale] = moved + (1.0 - covered) * light * average[scale] + drawn[scale]
+    return result
+
+
 HEAD = head.Head(
     targets=lambda model: {"image": (*model.image_size, 3)},
     term_targets={"image_instance_mask": head.TermTarget("image_instance", lambda model: model.image_size)},
     build=lambda model: decoders.of_image(model, 3), scales=head.SCALES, tokens="image", initial_bias=0.5,
     losses=_losses, weights=_weights, average=_average,
+    guide=head.Guide(view="image", plane=lambda model: model.image_size, width=lambda model: model.guided_channels[0],
+                     channels=lambda model, scale: 3, shrink=tokens.IMAGE_SHRINK, see=_see, compose=_compose,
+                     blurs=True),
     frames=head.Frames(
         field="image", of=lambda value, model: jnp.clip(value, 0.0, 1.0), sums=_sums, error=_error, error_name="image",
         metrics={"psnr_db": head.Metric("frames", streaming.mean, "PSNR", "dB", 2, on_screen=True, by_step=True,

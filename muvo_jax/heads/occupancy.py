@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import jax.numpy as jnp
 import numpy as np
 
 from muvo_jax import head, types
 from muvo_jax.config import LossConfig, ModelConfig, VoxelGrid
 from muvo_jax.metrics import baselines, occupancy, streaming
-from muvo_jax.model import decoders
+from muvo_jax.model import decoders, glimpse
 from muvo_jax.objectives import classification, labels, scal
+from muvo_jax.ops import resample
 
+_TRUST = 3.0  # log-odds that evidence of a hit or of a look through is worth to a fresh model
 _PRIOR_FRAMES = 4.0  # frames of evidence, a quarter of them occupied, that a voxel of the average frame starts with
 
 
@@ -93,10 +96,39 @@ def _draw_ahead(frame: np.ndarray, scene, columns_px: int) -> np.ndarray:
     return panels.occupancy_from_behind(frame, scene.grid, size_px=(max(96, round(0.39 * columns_px)), columns_px))
 
 
+def _see(seen: glimpse.VoxelGlimpse, config: ModelConfig) -> types.Array:
+    del config
+    moving = [] if seen.onward is None else [seen.onward]
+    return jnp.concatenate([seen.newest, seen.older, *moving], axis=-1)
+
+
+def _compose(raw, seen: glimpse.VoxelGlimpse, mean, config: ModelConfig) -> dict[int, types.Array]:
+    grid = config.voxels
+    heights = grid.origin_m[2] + grid.voxel_size_m * jnp.arange(grid.shape[2], dtype=jnp.float32)
+    trust = jnp.where(heights >= occupancy.ABOVE_ROAD_M - 1e-3, _TRUST, 0.0).reshape(1, 1, 1, -1)
+    # Above the road only: the road's rings do not move with the world. The newest scan has the say; the older ones
+    # where it has none. (Added up, what moves is cancelled out.)
+    evidence = seen.newest + (1.0 - jnp.abs(seen.newest)) * seen.older
+    if seen.onward is not None:  # where it was may be hidden by it now, or not: that is left to be learned
+        evidence = jnp.maximum(evidence, seen.onward)
+    believed = trust * evidence
+    raw = {scale: value.reshape(*value.shape[:3], -1, 2) for scale, value in raw.items()}
+    own, result = mean(raw), {}
+    for scale in head.SCALES:
+        if scale > 1:
+            believed = resample.max_pool2(believed)
+        result[scale] = own[scale] + jnp.stack([jnp.zeros_like(believed), believed], axis=-1)
+    return result
+
+
 HEAD = head.Head(
     targets=lambda model: {"occupancy": model.voxels.shape},
     build=lambda model: decoders.of_voxels(model, 2), scales=head.SCALES, tokens="occupancy", initial_bias=0.0,
     losses=_losses, weights=_weights, average=_average,
+    guide=head.Guide(view="occupancy", plane=lambda model: model.voxels.shape[:2],
+                     width=lambda model: model.guided_channels[2],
+                     channels=lambda model, scale: 2 * model.voxels.shape[2] // scale, shrink=8, see=_see,
+                     compose=_compose),
     frames=head.Frames(
         field="occupancy", sums=_sums,
         of=lambda value, model: occupancy.predicted_occupied(value, model.occupied_above),

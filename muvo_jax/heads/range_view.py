@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 
 from muvo_jax import head, types
 from muvo_jax.config import LossConfig, ModelConfig, VoxelGrid
 from muvo_jax.metrics import baselines, occupancy, points, streaming
-from muvo_jax.model import decoders, outputs
+from muvo_jax.model import decoders, glimpse, outputs, tokens
 from muvo_jax.objectives import chamfer, labels, regression
+
+_NEAR_M = 10.0  # ranges are seen as 10 m / (10 m + range) too: near ones matter
 
 
 def _finish(value: types.Array, scale: int, config: ModelConfig) -> types.Array:
@@ -69,10 +73,50 @@ def _draw_points(frame: np.ndarray, scene, columns_px: int) -> np.ndarray:
                             side_px=columns_px, height_span_m=panels.height_span(scene.grid))
 
 
+def _nearness(range_m: types.Array) -> types.Array:
+    return jnp.where(range_m > 0.0, _NEAR_M / (_NEAR_M + jnp.maximum(range_m, 0.0)), 0.0)
+
+
+def _see(seen: glimpse.RangeGlimpse, config: ModelConfig) -> types.Array:
+    scale_m = config.range_scale_m
+    given = [seen.filled_m, seen.newest_m, seen.still_m]
+    channels = [*map(_nearness, given), *(jnp.maximum(value, 0.0) / scale_m for value in (given[0], given[2])),
+                *((value > 0.0).astype(jnp.float32) for value in (seen.moved_m, *given)), seen.sky,
+                seen.height_m / 5.0]
+    return jnp.stack(channels, axis=-1)
+
+
+def _compose(raw, seen: glimpse.RangeGlimpse, mean, config: ModelConfig) -> dict[int, types.Array]:
+    """x, y, z and range in units of range_scale_m; the range is -1 m where nothing is expected to return."""
+    average = mean({scale: jnp.zeros_like(value[..., :4]) for scale, value in raw.items()})
+    nothing, result = types.RANGE_NO_RETURN_M / config.range_scale_m, {}
+    for scale, value in raw.items():
+        moved, filled, sky = (array[:, ::scale, ::scale] for array in (seen.moved_m, seen.filled_m, seen.sky))
+        usual = average[scale][..., 3]
+        range_ = jnp.where(filled > 0.0, filled / config.range_scale_m, jnp.maximum(usual, 0.0)) + value[..., 3]
+        prior = jnp.where(moved > 0.0, 2.0, jnp.where(filled > 0.0, 1.0, jnp.where(usual > 0.0, 0.5, -1.0)))
+        logit = value[..., 4] + jnp.where(sky > 0.0, -2.0, prior)
+        soft = jax.nn.sigmoid(logit)
+        # Decided, because half a range is no range; the gradient is that of the probability.
+        returned = jax.lax.stop_gradient((logit > 0.0).astype(jnp.float32) - soft) + soft
+        expected = nothing + returned * (range_ - nothing)
+        points = average[scale][..., :3]  # with range_view_points="beams" they are differences from the beam already
+        if config.range_view_points == "free":
+            on_beam = outputs.along_beams(jnp.concatenate([jnp.zeros_like(points), jnp.expand_dims(range_, -1)], -1),
+                                          scale, config)
+            points = jnp.where(jnp.expand_dims(filled > 0.0, -1), on_beam[..., :3], points)
+        points = value[..., :3] + points + seen.off_beam_m[:, ::scale, ::scale] / config.range_scale_m
+        result[scale] = jnp.concatenate([points, jnp.expand_dims(expected, -1)], axis=-1)
+    return result
+
+
 HEAD = head.Head(
     targets=lambda model: {"range_view": (model.range_view.rows, model.range_view.columns, 4)},
     build=lambda model: decoders.of_range_view(model, 4), scales=head.SCALES, tokens="range_view", finish=_finish,
     initial_bias=0.0, losses=_losses, weights=_weights, average=_average,
+    guide=head.Guide(view="range_view", plane=lambda model: (model.range_view.rows, model.range_view.columns),
+                     width=lambda model: model.guided_channels[1], channels=lambda model, scale: 5,
+                     shrink=tokens.RANGE_VIEW_SHRINK, see=_see, compose=_compose),
     frames=head.Frames(
         field="range_view", of=lambda value, model: value, sums=_sums, error=_error, error_name="range",
         metrics={"chamfer_m": head.Metric("all", streaming.mean, "Chamfer", "m", 3, higher=False, on_screen=True,

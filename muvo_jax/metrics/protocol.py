@@ -96,8 +96,8 @@ def shown_heads(config: config_lib.ModelConfig) -> tuple[str, ...]:
 
 
 def finish(predictions: types.Predictions, model: config_lib.ModelConfig) -> dict[str, types.Array]:
-    """Full-scale predictions of shown heads as frames (head.Frames.of): the image clipped to [0, 1], occupancy decided as
-    the model says, classes instead of logits."""
+    """Full-scale predictions of shown heads as frames (head.Frames.of): the image clipped to [0, 1], occupancy decided
+    as the model says, classes instead of logits."""
     return {name: frames.of(predictions[name], model) for name, frames in head_lib.shown(predictions.heads).items()}
 
 

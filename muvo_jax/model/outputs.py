@@ -45,7 +45,7 @@ def along_beams(raw: jax.Array, scale: int, config: ModelConfig) -> jax.Array:
 
 
 def initial_constants(config: ModelConfig) -> dict[str, float]:
-    """Path of a parameter -> its first value, for the heads that this model has.
+    """Path of a parameter -> its first value, for the heads whose decoders do not see the memory.
 
     Where the average training frame is the first guess, the last layers start at zero and add nothing to it.
     """
@@ -53,12 +53,10 @@ def initial_constants(config: ModelConfig) -> dict[str, float]:
     guessed = memory.guessed_heads(config)
     for name in config.heads:
         head = head_lib.get(name)
-        if head.initial_bias is None:
+        if head.initial_bias is None or name in guessed:
             continue
         for scale in head.scales:
-            path = f"decoders_{name}/{'decoder/' if name in guessed else ''}head_{scale}"
-            if name in guessed and name == "image" and scale == 1:
-                values[f"decoders_{name}/decoder/blur/kernel"] = 0.0
+            path = f"decoders_{name}/head_{scale}"
             if config.first_guess != "zero" and head.average is not None:
                 values |= {f"{path}/bias": 0.0, f"{path}/kernel": 0.0}
             else:

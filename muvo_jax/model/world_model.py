@@ -67,7 +67,7 @@ class Network(linen.Module):
         self.transition = transition.REGISTRY[config.latent](config)
         guessed = memory_lib.guessed_heads(config)
         described = {name: head_lib.get(name) for name in KNOWN_HEADS if name in config.heads}
-        self.decoders = {name: guided.GuidedHead(config, name) if name in guessed else head.build(config)
+        self.decoders = {name: guided.GuidedHead(config, head.guide) if name in guessed else head.build(config)
                          for name, head in described.items()}
         if config.first_guess != "zero":
             self.first_guess = {name: outputs.FirstGuess() for name, head in described.items()
@@ -188,7 +188,8 @@ class WorldModel:
         """
         if batch is not None:
             self._frames(batch)
-        constants = {**outputs.initial_constants(self.config), **transition.initial_constants(self.config),
+        constants = {**outputs.initial_constants(self.config), **guided.initial_constants(self.config),
+                     **transition.initial_constants(self.config),
                      **fusion.initial_constants(self.config)}
         return init_lib.fill(self.variable_shapes(), key, constants)
 

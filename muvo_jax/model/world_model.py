@@ -45,7 +45,7 @@ ROUTE_MAP_SIZE = (64, 64)
 
 
 class Network(linen.Module):
-    """All parameters under one roof; WorldModel is the public face."""
+    """What stands around the transition: from frames to embeddings, from states to outputs."""
 
     config: ModelConfig
 
@@ -64,7 +64,6 @@ class Network(linen.Module):
         if config.speed:
             self.speed = measurements.SpeedEncoder(config)
         self.fusion = fusion.REGISTRY[config.fusion](config)
-        self.transition = transition.REGISTRY[config.latent](config)
         guessed = memory_lib.guessed_heads(config)
         described = {name: head_lib.get(name) for name in KNOWN_HEADS if name in config.heads}
         self.decoders = {name: guided.GuidedHead(config, head.guide) if name in guessed else head.build(config)
@@ -85,23 +84,6 @@ class Network(linen.Module):
         image_map = self.camera(frames, mode) if self.config.camera != NO_SENSOR else None
         lidar_map = self.lidar(frames, mode) if self.config.lidar != NO_SENSOR else None
         return self.fusion(image_map, lidar_map, measured, mode, keys)
-
-    def observe_step(self, *args):
-        return self.transition.observe_step(*args)
-
-    def imagine_step(self, noise: jax.Array, state: LatentState, action: jax.Array) -> tuple[LatentState, Gaussian]:
-        following, prior = self.transition.imagine_step(noise, state, action)
-        if self.config.tracks_motion and self.config.kinematics is None:
-            assert state.vantage is not None  # of a model that tracks its motion
-            vantage = memory_lib.moved_on(state.vantage, self.ego_motion(following.features))
-            following = dataclasses.replace(following, vantage=vantage)
-        return following, prior
-
-    def ego_motion(self, features: jax.Array) -> Motion:
-        """The step that led to states, as the head says."""
-        value = self.decoders["ego_motion"](self.read(features, "ego_motion"))[1]
-        value = head_lib.get("ego_motion").finish(value, 1, self.config)
-        return Motion(value[..., :3], value[..., 3])
 
     def decode(self, features: jax.Array, vantage: Vantage | None, memory: Memory | None, rows: jax.Array | None,
                names: tuple[str, ...]) -> dict[str, dict[int, jax.Array]]:
@@ -128,12 +110,11 @@ class Network(linen.Module):
         group = head_lib.get(head).tokens
         return tokens.pool(features, self.config) if group is None else tokens.read(features, group, self.config)
 
-    def everything(self, frames: dict[str, jax.Array], noise: StepNoise, action: jax.Array, state: LatentState,
-                   is_first: jax.Array) -> dict[str, dict[int, jax.Array]]:
-        """Touches every parameter once; only its shapes are ever computed."""
-        state, _ = self.observe_step(noise, state, action, self.encode(frames, norm.Mode(), None), is_first)
+    def everything(self, frames: dict[str, jax.Array], state: LatentState) -> jax.Array:
+        """Touches every parameter once; only its shapes are ever computed. Returns the embedding."""
         memory = memory_lib.empty(self.config, 1)
-        return self.decode(state.features, state.vantage, memory, jnp.zeros((1,), jnp.int32), self.config.heads)
+        self.decode(state.features, state.vantage, memory, jnp.zeros((1,), jnp.int32), self.config.heads)
+        return self.encode(frames, norm.Mode(), None)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -173,8 +154,7 @@ class WorldModel:
     def variable_shapes(self) -> dict[str, Any]:
         """The variables as jax.ShapeDtypeStruct leaves."""
         # The plain convolutions trace fastest, and the parameters do not depend on the form.
-        network = Network(dataclasses.replace(self.config, convolution="xla"))
-        return dict(_variable_shapes(network))
+        return dict(_variable_shapes(dataclasses.replace(self.config, convolution="xla")))
 
     def init(self, key: jax.Array, batch: Batch | None = None) -> dict[str, Any]:
         """Fresh variables as float32 NumPy arrays; see muvo_jax.nn.init for the rules.
@@ -248,7 +228,7 @@ class WorldModel:
           the state to go on from, and (prior, posterior). Its sample is the posterior's, or the prior's where
           noise.use_prior says so.
         """
-        return self._apply(variables, "observe_step", noise, state, action, embedding, is_first)
+        return self._move(variables, "observe_step", noise, state, action, embedding, is_first)
 
     def imagine_step(self, variables: Variables, noise: jax.Array, state: LatentState,
                      action: jax.Array) -> tuple[LatentState, Gaussian]:
@@ -256,7 +236,13 @@ class WorldModel:
 
         noise: standard normal numbers of the shape of the stochastic state, or zeros.
         """
-        return self._apply(variables, "imagine_step", noise, state, action)
+        following, prior = self._move(variables, "imagine_step", noise, state, action)
+        if self.config.tracks_motion and self.config.kinematics is None:
+            assert state.vantage is not None  # of a model that tracks its motion
+            arrival = self.ego_motion(variables, following)
+            vantage = memory_lib.moved_on(state.vantage, Motion(arrival[..., :3], arrival[..., 3]))
+            following = dataclasses.replace(following, vantage=vantage)
+        return following, prior
 
     def ego_motion(self, variables: Variables, states: LatentState) -> jax.Array:
         """What the head of that name says of states [*L, ...]: [*L, 4], as Batch.ego_motion."""
@@ -303,6 +289,11 @@ class WorldModel:
         return Predictions({name: {scale: finish(name, scale, value).reshape(*lead, *value.shape[1:])
                                    for scale, value in scales.items()} for name, scales in flat.items()})
 
+    def _move(self, variables: Variables, method: str, *args) -> Any:
+        """A step of the transition, by its own part of the variables."""
+        own = {kind: tree["transition"] for kind, tree in variables.items() if "transition" in tree}
+        return transition.REGISTRY[self.config.latent](self.config).apply(own, *args, method=method)
+
     def _apply(self, variables: Variables, method: str, *args, **options) -> Any:
         return Network(self.config).apply(variables, *args, method=method, **options)
 
@@ -342,12 +333,16 @@ def inputs(config: ModelConfig) -> dict[str, tuple[int, ...]]:
 
 
 @functools.lru_cache(maxsize=8)
-def _variable_shapes(network: Network) -> dict[str, Any]:
-    config = network.config
+def _variable_shapes(config: ModelConfig) -> dict[str, Any]:
+    network, moving = Network(config), transition.REGISTRY[config.latent](config)
     frames = {name: jax.ShapeDtypeStruct((1, *shape), BATCH_FIELDS[name][0]) for name, shape in inputs(config).items()}
-    state = WorldModel(config).initial_state(1)
+    state, key = moving.initial_state(config, 1), jax.random.key(0)
     noise = StepNoise(state.stochastic, state.stochastic, jnp.zeros((1,), jnp.bool_))
-    action = jax.ShapeDtypeStruct((1, 2), jnp.float32)
-    init = functools.partial(network.init, method="everything")
-    return jax.eval_shape(init, jax.random.key(0), frames, noise, action, state,
-                          jax.ShapeDtypeStruct((1,), jnp.bool_))
+    action, is_first = jnp.zeros((1, 2), jnp.float32), jnp.zeros((1,), jnp.bool_)
+
+    def fresh(frames):
+        embedding, around = network.init_with_output(key, frames, state, method="everything")
+        own = moving.init(key, noise, state, action, embedding, is_first, method="observe_step")
+        return {kind: {**tree, **({"transition": own[kind]} if kind in own else {})} for kind, tree in around.items()}
+
+    return jax.eval_shape(fresh, frames)

@@ -61,9 +61,9 @@ def test_a_made_up_head_trains_is_judged_and_is_drawn(config, tmp_path):
     assert next(iter(table.columns[0].cells)) == "speed error (m/s)"
 
     views = [sheets.views_of_batch(batch, 7), sheets.views_of_frames(frames, 7)]
-    (path,) = sheets.write_dream(tmp_path, views[0], {"world model": views[1]}, batch.action[7],
-                                 sheets.Scene.of(config), context=2, title="t", animate=False)
-    assert (np.asarray(Image.open(path)) == (0, 200, 255)).all(axis=-1).any()
+    sensors, *_ = sheets.write_dream(tmp_path, views[0], {"world model": views[1]}, batch.action[7],
+                                     sheets.Scene.of(config), context=2, title="t", animate=False)
+    assert (np.asarray(Image.open(sensors)) == (0, 200, 255)).all(axis=-1).any()
 
 
 def test_what_it_learns_from_must_be_there(config):

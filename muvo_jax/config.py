@@ -103,7 +103,7 @@ class ModelConfig:
         constant input has shape / 2**(blocks + 3) voxels.
       occupancy_token_stages: doublings at full width of the 2D latent's voxel decoder; the voxel tokens are a grid of
         shape / 2**(stages + 3).
-      first_guess: "training_mean": decoders draw the difference from the average training frame; see model/outputs.py.
+      first_guess: "training_mean": decoders draw the difference from the average training frame; see model/decoders.py.
         "last_seen": from what the sensors showed of late, moved by the motion of the car, and from the average where
         that covers nothing; see model/memory.py.
       memory_frames: so many observations are remembered for that.

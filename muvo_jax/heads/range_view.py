@@ -9,28 +9,43 @@ import numpy as np
 from muvo_jax import head, types
 from muvo_jax.config import LossConfig, ModelConfig, VoxelGrid
 from muvo_jax.metrics import baselines, occupancy, points, streaming
-from muvo_jax.model import decoders, glimpse, outputs, tokens
+from muvo_jax.model import decoders, glimpse, tokens
 from muvo_jax.objectives import chamfer, labels, regression
+from muvo_jax.ops import range_view
 
 _NEAR_M = 10.0  # ranges are seen as 10 m / (10 m + range) too: near ones matter
+
+
+def along_beams(raw: types.Array, scale: int, config: ModelConfig) -> types.Array:
+    """Raw range view [N, Hr/scale, Wr/scale, 4] (units of range_scale_m): x, y, z become differences from the beam.
+
+    With range_view_points="beams" the three coordinates of a pixel are drawn as the difference from the point at the
+    predicted range along its beam: geometry that is known need not be learned.
+    """
+    geometry = config.range_view
+    beams = range_view.beam_directions(geometry)[::scale, ::scale]
+    position = np.asarray(geometry.position_m, np.float32) / np.float32(config.range_scale_m)
+    ranges = raw[..., 3:]
+    points = raw[..., :3] + jnp.asarray(beams)[None] * ranges + jnp.asarray(position).reshape(1, 1, 1, 3)
+    return jnp.concatenate([points, ranges], axis=-1)
 
 
 def _finish(value: types.Array, scale: int, config: ModelConfig) -> types.Array:
     """In metres."""
     if config.range_view_points == "beams":
-        value = outputs.along_beams(value, scale, config)
+        value = along_beams(value, scale, config)
     return value * config.range_scale_m
 
 
 def _losses(learned: head.Learned) -> dict[str, head.Sums]:
-    model, loss, range_view = learned.model, learned.loss, learned.truth("range_view")
+    model, loss, truth = learned.model, learned.loss, learned.truth("range_view")
     sums: dict[str, head.Sums] = {}
-    for scale, target in labels.range_view_labels(range_view).items():
+    for scale, target in labels.range_view_labels(truth).items():
         sums[f"range_xyz_{scale}"], sums[f"range_depth_{scale}"] = regression.range_view_sums(
             learned.predictions[scale], target, scale_m=model.range_scale_m, mask_holes=model.numerics == "standard")
     if loss.chamfer:
         sums["chamfer_1"] = chamfer.chamfer_sums(
-            learned.predictions[1], range_view, learned.keys, points=loss.chamfer_points, scale_m=model.range_scale_m,
+            learned.predictions[1], truth, learned.keys, points=loss.chamfer_points, scale_m=model.range_scale_m,
             return_threshold_m=loss.return_threshold_m)
     return sums
 
@@ -102,8 +117,8 @@ def _compose(raw, seen: glimpse.RangeGlimpse, mean, config: ModelConfig) -> dict
         expected = nothing + returned * (range_ - nothing)
         points = average[scale][..., :3]  # with range_view_points="beams" they are differences from the beam already
         if config.range_view_points == "free":
-            on_beam = outputs.along_beams(jnp.concatenate([jnp.zeros_like(points), jnp.expand_dims(range_, -1)], -1),
-                                          scale, config)
+            on_beam = along_beams(jnp.concatenate([jnp.zeros_like(points), jnp.expand_dims(range_, -1)], -1), scale,
+                                  config)
             points = jnp.where(jnp.expand_dims(filled > 0.0, -1), on_beam[..., :3], points)
         points = value[..., :3] + points + seen.off_beam_m[:, ::scale, ::scale] / config.range_scale_m
         result[scale] = jnp.concatenate([points, jnp.expand_dims(expected, -1)], axis=-1)

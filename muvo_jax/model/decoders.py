@@ -3,6 +3,10 @@
 Each maps features [N, F], or with the 2D latent a map of tokens [N, *grid, C], to {scale: array}, scale 1 being the
 full size, 2 and 4 halved once and twice. Those of tokens are a convolution, doublings at full width, then three with
 half, a quarter and an eighth of it, each of which ends in one scale. What heads are built of stands at the end.
+
+With first_guess="training_mean", an addition to the paper (docs/design.md says what it brings), a decoder draws the
+difference from the average training frame, which the training loop measures before the first step (FirstGuess): a
+fresh model predicts the average and learns the rest.
 """
 
 from __future__ import annotations
@@ -11,8 +15,9 @@ import jax
 import jax.numpy as jnp
 from flax import linen
 
+from muvo_jax import head as head_lib
 from muvo_jax.config import ModelConfig
-from muvo_jax.model import common, tokens
+from muvo_jax.model import common, memory, tokens
 from muvo_jax.nn import layers, norm
 from muvo_jax.ops import resample
 
@@ -218,6 +223,40 @@ class VectorDecoder(linen.Module):
     def __call__(self, features: jax.Array) -> dict[int, jax.Array]:
         out = layers.Mlp((self.width, self.width, self.channels), self.compute, name="mlp")(features)
         return {1: out.astype(jnp.float32)}
+
+
+class FirstGuess(linen.Module):
+    """{scale: [N, *size, C]} -> the same plus one constant [*size, C] a scale, kept beside BatchNorm's statistics."""
+
+    @linen.compact
+    def __call__(self, outputs: dict[int, jax.Array]) -> dict[int, jax.Array]:
+        return {scale: value + self.variable("batch_stats", f"scale_{scale}", jnp.zeros, value.shape[1:]).value[None]
+                for scale, value in outputs.items()}
+
+
+def first_guess_path(head: str) -> str:
+    """Where the constants of a head lie in `batch_stats`."""
+    return f"first_guess_{head}"
+
+
+def initial_constants(config: ModelConfig) -> dict[str, float]:
+    """Path of a parameter -> its first value, for the heads whose decoders do not see the memory.
+
+    Where the average training frame is the first guess, the last layers start at zero and add nothing to it.
+    """
+    values: dict[str, float] = {}
+    guessed = memory.guessed_heads(config)
+    for name in config.heads:
+        head = head_lib.get(name)
+        if head.initial_bias is None or name in guessed:
+            continue
+        for scale in head.scales:
+            path = f"decoders_{name}/head_{scale}"
+            if config.first_guess != "zero" and head.average is not None:
+                values |= {f"{path}/bias": 0.0, f"{path}/kernel": 0.0}
+            else:
+                values[f"{path}/bias"] = head.initial_bias
+    return values
 
 
 def of_image(config: ModelConfig, channels: int) -> linen.Module:

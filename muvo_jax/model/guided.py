@@ -15,7 +15,7 @@ from flax import linen
 
 from muvo_jax import head as head_lib
 from muvo_jax.config import ModelConfig
-from muvo_jax.model import common, memory, outputs
+from muvo_jax.model import common, decoders, memory
 from muvo_jax.model import glimpse as glimpse_lib
 from muvo_jax.nn import layers
 from muvo_jax.ops import conv_cpu
@@ -87,7 +87,7 @@ class GuidedHead(linen.Module):
 
     @linen.compact
     def __call__(self, features: jax.Array, glimpse: glimpse_lib.Glimpse, numbers: jax.Array,
-                 mean: outputs.FirstGuess) -> dict[int, jax.Array]:
+                 mean: decoders.FirstGuess) -> dict[int, jax.Array]:
         seen = self.guide.see(glimpse, self.config)
         raw = GuidedDecoder(self.config, self.guide, name="decoder")(features, seen, numbers)
         return self.guide.compose(raw, glimpse, mean, self.config)

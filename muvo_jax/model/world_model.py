@@ -23,7 +23,7 @@ from flax import linen
 
 from muvo_jax import head as head_lib
 from muvo_jax.config import KNOWN_HEADS, NO_SENSOR, ModelConfig
-from muvo_jax.model import camera, fusion, glimpse, guided, lidar, measurements, outputs, tokens, transition
+from muvo_jax.model import camera, decoders, fusion, glimpse, guided, lidar, measurements, tokens, transition
 from muvo_jax.model import memory as memory_lib
 from muvo_jax.nn import init as init_lib
 from muvo_jax.nn import norm
@@ -69,7 +69,7 @@ class Network(linen.Module):
         self.decoders = {name: guided.GuidedHead(config, head.guide) if name in guessed else head.build(config)
                          for name, head in described.items()}
         if config.first_guess != "zero":
-            self.first_guess = {name: outputs.FirstGuess() for name, head in described.items()
+            self.first_guess = {name: decoders.FirstGuess() for name, head in described.items()
                                 if head.average is not None}
 
     def encode(self, frames: dict[str, jax.Array], mode: norm.Mode, keys: jax.Array | None) -> jax.Array:
@@ -168,7 +168,7 @@ class WorldModel:
         """
         if batch is not None:
             self._frames(batch)
-        constants = {**outputs.initial_constants(self.config), **guided.initial_constants(self.config),
+        constants = {**decoders.initial_constants(self.config), **guided.initial_constants(self.config),
                      **transition.initial_constants(self.config),
                      **fusion.initial_constants(self.config)}
         return init_lib.fill(self.variable_shapes(), key, constants)

@@ -1,4 +1,4 @@
-"""The average training frame as the start of the decoders (`model.first_guess = "training_mean"`, model/outputs.py)."""
+"""The average training frame as the start of the decoders (`model.first_guess = "training_mean"`, FirstGuess)."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 from muvo_jax import config as config_lib
 from muvo_jax import head as head_lib
 from muvo_jax.metrics import baselines
-from muvo_jax.model import outputs
+from muvo_jax.model import decoders
 from muvo_jax.training import parallel as parallel_lib
 from muvo_jax.training import state as state_lib
 
@@ -17,7 +17,7 @@ _LEAST_SPREAD = 0.02  # of an action that hardly ever moves: its noise is not to
 
 
 def constants(mean: baselines.TrainingMean, config: config_lib.ModelConfig) -> dict[str, dict[str, np.ndarray]]:
-    """What `outputs.FirstGuess` adds, in the decoders' raw units: the subtree of `batch_stats` for every such head.
+    """What `decoders.FirstGuess` adds, in the decoders' raw units: the subtree of `batch_stats` for every such head.
 
     Args:
       mean: of the training frames.
@@ -25,7 +25,7 @@ def constants(mean: baselines.TrainingMean, config: config_lib.ModelConfig) -> d
     """
     averages = {name: average(mean, config) for name in config.heads
                 if (average := head_lib.get(name).average) is not None}
-    return {outputs.first_guess_path(head): {f"scale_{scale}": np.asarray(value, np.float32)
+    return {decoders.first_guess_path(head): {f"scale_{scale}": np.asarray(value, np.float32)
                                              for scale, value in scales.items()} for head, scales in averages.items()}
 
 

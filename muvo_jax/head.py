@@ -210,7 +210,7 @@ class Head:
       initial_bias: bias of the last layers "head_SCALE" of a fresh model, the network's first guess.
       average: (metrics.baselines.TrainingMean, config) -> {scale: the average training frame in units of the outputs},
         which decoders start from (ModelConfig.first_guess); None where they start from zero.
-      guide: how its decoder sees the memory (first_guess="last_seen"); None for one that does not.
+      guide: how its decoder sees the memory (first_guess="last_seen"); None for one that does not. It needs an average.
       term_targets: Batch field -> the term that reads it beside the targets.
       frames: how it is judged and drawn; None for what is neither.
     """
@@ -223,7 +223,7 @@ class Head:
     tokens: str | None = None
     finish: Callable[[types.Array, int, ModelConfig], types.Array] = as_drawn
     initial_bias: float | None = None
-    average: Callable[[Any, ModelConfig], Mapping[int, np.ndarray]] | None = None
+    average: Callable[[Any, ModelConfig], Mapping[int, types.ArrayLike]] | None = None
     guide: Guide | None = None
     term_targets: Mapping[str, TermTarget] = dataclasses.field(default_factory=dict)
     frames: Frames | None = None

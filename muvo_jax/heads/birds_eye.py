@@ -14,7 +14,8 @@ from muvo_jax.objectives import classification, instances, labels
 
 def _losses(learned: head.Learned) -> dict[str, head.Sums]:
     """Predictions are class logits, then offset (2) and centre (1)."""
-    loss, count, sums = learned.loss, BIRDS_EYE_CLASSES, dict[str, head.Sums]()
+    loss, count = learned.loss, BIRDS_EYE_CLASSES
+    sums: dict[str, head.Sums] = {}
     numbers = labels.map_labels(learned.truth("birds_eye_instances"))
     for scale, target in labels.map_labels(learned.truth("birds_eye_classes")).items():
         prediction = learned.predictions[scale]

@@ -15,7 +15,8 @@ from muvo_jax.ops import resample
 
 
 def _losses(learned: head.Learned) -> dict[str, head.Sums]:
-    loss, sums = learned.loss, dict[str, head.Sums]()
+    loss = learned.loss
+    sums: dict[str, head.Sums] = {}
     masks = labels.map_labels(learned.truth("image_instance_mask")) if loss.image_instance else None
     for scale, target in labels.image_labels(learned.truth("image")).items():
         prediction = learned.predictions[scale]
@@ -44,7 +45,8 @@ def _average(mean: baselines.TrainingMean, config: ModelConfig) -> dict[int, typ
 
 def _sums(judged: head.Judged) -> dict[str, streaming.Sums]:
     target = np.asarray(judged.truth.image)
-    sums = {"frames": streaming.mean_sums(np.asarray(image.frame_psnr_db(judged.frames, target)))}
+    psnr_db = np.asarray(image.frame_psnr_db(judged.frames, target))
+    sums: dict[str, streaming.Sums] = {"frames": streaming.mean_sums(psnr_db)}
     if judged.truth.image_moving_mask is not None:
         sums["movers"] = image.masked_sums(judged.frames, target, np.asarray(judged.truth.image_moving_mask))
     return sums

@@ -50,7 +50,8 @@ def _log_odds(occupied: np.ndarray, known: np.ndarray) -> np.ndarray:
 def _sums(judged: head.Judged) -> dict[str, streaming.Sums]:
     occupied, target = np.asarray(judged.frames), np.asarray(judged.truth.occupancy)
     high = occupancy.above_road(judged.config.model.voxels)
-    above, sums = (occupied[..., high], target[..., high]), {}
+    above = (occupied[..., high], target[..., high])
+    sums: dict[str, streaming.Sums] = {}
     for variant, unknown_is_empty in occupancy.VARIANTS.items():
         sums[variant] = occupancy.counts(occupied, target, unknown_is_empty=unknown_is_empty)
         sums[f"above_{variant}"] = occupancy.counts(*above, unknown_is_empty=unknown_is_empty)

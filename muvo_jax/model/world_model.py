@@ -66,8 +66,8 @@ class Network(linen.Module):
         self.fusion = fusion.REGISTRY[config.fusion](config)
         guessed = memory_lib.guessed_heads(config)
         described = {name: head_lib.get(name) for name in KNOWN_HEADS if name in config.heads}
-        self.decoders = {name: guided.GuidedHead(config, head.guide) if name in guessed else head.build(config)
-                         for name, head in described.items()}
+        self.decoders = {name: guided.GuidedHead(config, head.guide) if head.guide is not None and name in guessed
+                         else head.build(config) for name, head in described.items()}
         if config.first_guess != "zero":
             self.first_guess = {name: decoders.FirstGuess() for name, head in described.items()
                                 if head.average is not None}

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from typing import NamedTuple
 
 import flax.struct
 import jax
@@ -84,7 +83,8 @@ class VoxelGlimpse:
 Glimpse = ImageGlimpse | RangeGlimpse | VoxelGlimpse
 
 
-class Sight(NamedTuple):
+@flax.struct.dataclass
+class Sight:
     """Which observations n vantages look at, the newest last.
 
     Attributes:
@@ -192,7 +192,8 @@ def _voxels(config: ModelConfig, memory: Memory, sight: Sight) -> VoxelGlimpse:
         return dataclasses.replace(glimpse, onward=_onward(memory, sight, evidence, hits, ahead, config.voxels)[:, 0])
     move = lambda values, which: reproject.move_voxels(values, sight.pose[:, -1], config.voxels, _wide(config.voxels),
                                                        which)
-    glimpse = VoxelGlimpse(*jnp.split(move(memory.evidence, sight.rows), 2, axis=-1), None)
+    newest, older = jnp.split(move(memory.evidence, sight.rows), 2, axis=-1)
+    glimpse = VoxelGlimpse(newest, older, None)
     if memory.onward is None:
         return glimpse
     step = jnp.minimum(sight.ahead, FORESEEN_STEPS) - 1

@@ -94,18 +94,18 @@ def prepare_frame(raw: schema.RawFrame, config: config_lib.Config) -> PreparedFr
                                f"Choose windows of sequences that have it (schema.Sequence.has).")
     ready: PreparedFrame = {name: raw[name] for name in ("action", "timestamp_s", "frame_id")}
     try:
-        if model.camera != config_lib.NO_SENSOR or "image" in config.targets:
+        if model.camera is not None or "image" in config.targets:
             ready["image"], ready["intrinsics"] = camera_ops.resize_crop(raw["image"], raw["intrinsics"],
                                                                          model.image_size)
             ready["camera_to_ego"] = raw["camera_to_ego"]
-        if model.lidar != config_lib.NO_SENSOR or "range_view" in config.targets:
+        if model.lidar is not None or "range_view" in config.targets:
             ready["range_view"] = range_view_ops.project(raw["points_m"], model.range_view)
         if "occupancy" in model.heads:
             ready["occupancy"] = _occupancy(raw, model)
     except ValueError as error:
         raise schema.DataError(f"frame {int(raw['frame_id'])}: {error}") from error
-    if model.lidar == "pp":
-        ready["points"], ready["point_count"] = padded_points(raw["points_m"], model.pillars.points,
+    if isinstance(model.lidar, config_lib.PillarLidar):
+        ready["points"], ready["point_count"] = padded_points(raw["points_m"], model.lidar.grid.points,
                                                                int(raw["frame_id"]))
     if model.navigation:
         ready |= {name: raw[name] for name in NAVIGATION}  # type: ignore[literal-required]
@@ -157,9 +157,9 @@ def needed(config: config_lib.Config, modalities: Collection[str]) -> frozenset[
     """The keys of RawFrame that `prepare_frame` must find, of a recording with these modalities."""
     model, targets = config.model, config.targets
     names = {"action", "timestamp_s", "frame_id"} | (_recorded(targets) - _OPTIONAL)
-    if model.camera != config_lib.NO_SENSOR or "image" in targets:
+    if model.camera is not None or "image" in targets:
         names |= {"image", "intrinsics", "camera_to_ego"}
-    if model.lidar != config_lib.NO_SENSOR or "range_view" in targets:
+    if model.lidar is not None or "range_view" in targets:
         names.add("points_m")
     if "occupancy" in model.heads:
         names.add("occupancy" if "occupancy" in modalities else "points_m")
@@ -200,8 +200,8 @@ def padded_points(points_m: np.ndarray, rows: int, seed: int) -> tuple[np.ndarra
     Of a longer scan a random subset stays, the same one each time: its first points would be one side of the world.
     """
     if len(points_m) > rows:
-        warnings.warn(f"scans with more than model.pillars.points={rows} points are thinned to a random subset of that "
-                      f"size.", schema.DataWarning, stacklevel=2)
+        warnings.warn(f"scans with more than model.lidar.grid.points={rows} points are thinned to a random subset of "
+                      f"that size.", schema.DataWarning, stacklevel=2)
         points_m = points_m[np.random.default_rng(seed).choice(len(points_m), rows, replace=False)]
     padded = np.zeros((rows, 3), np.float32)
     padded[:len(points_m)] = points_m
@@ -232,10 +232,8 @@ def _fit_model(model: config_lib.ModelConfig, description: schema.RecordingDescr
         changes["range_view"] = dataclasses.replace(lidar, rows=model.range_view.rows, columns=model.range_view.columns)
     if description.voxels is not None and "occupancy" in heads:
         changes["voxels"] = description.voxels
-        changes["occupancy_blocks"] = _occupancy_blocks(model.occupancy_blocks, description.voxels)
-        if changes["occupancy_blocks"] != model.occupancy_blocks:
-            notes.append(f"the voxel decoder has {changes['occupancy_blocks']} full-width stages instead of "
-                         f"{model.occupancy_blocks}: the recorded grid is only {_by(description.voxels.shape)}.")
+        if isinstance(model.latent, config_lib.VectorLatent):
+            changes["latent"] = _fit_voxel_decoder(model.latent, description.voxels, notes)
     elif "occupancy" in heads:
         notes.append("no occupancy is recorded: the target is what each lidar scan hit and looked through, unknown "
                      "elsewhere.")
@@ -260,10 +258,10 @@ def _fit_first_guess(model: config_lib.ModelConfig, description: schema.Recordin
     Raises:
       DataError: where the user asked for the memory.
     """
-    if model.first_guess != "last_seen":
+    if not isinstance(model.first_guess, config_lib.LastSeen):
         return model
     reason = ""
-    if model.lidar == config_lib.NO_SENSOR:
+    if model.lidar is None:
         reason = "there are no lidar scans, and nothing moves without ranges"
     elif description.contract.kinematics == "bicycle":
         if "speed_mps" not in description.modalities:
@@ -273,11 +271,11 @@ def _fit_first_guess(model: config_lib.ModelConfig, description: schema.Recordin
                   "learns it from recorded poses")
     if not reason:
         return model
-    if "model.first_guess" in keep:
+    if any(name.startswith("model.first_guess") for name in keep):
         raise schema.DataError(f"model.first_guess=last_seen with recording {description.name!r}: {reason}. Choose "
                                f"model.first_guess=training_mean otherwise.")
     notes.append(f"what was last seen is not moved, because {reason}: decoders start from the training mean.")
-    return dataclasses.replace(model, first_guess="training_mean")
+    return dataclasses.replace(model, first_guess=config_lib.TrainingMean())
 
 
 def _without_what_lacks(model: config_lib.ModelConfig, description: schema.RecordingDescription,
@@ -304,12 +302,12 @@ def _without_what_lacks(model: config_lib.ModelConfig, description: schema.Recor
         notes.append(f"no {'images are' if sensor == 'camera' else 'lidar scans are'} recorded: the model has no "
                      f"{sensor} input{which}.")
     kept = tuple(head for head in model.heads if head not in heads)
-    seen = {sensor for sensor in ("camera", "lidar") if getattr(model, sensor) != config_lib.NO_SENSOR} - missing
+    seen = {sensor for sensor in ("camera", "lidar") if getattr(model, sensor) is not None} - missing
     if not seen or not kept:
         raise schema.DataError(f"recording {description.name!r} lacks {', '.join(sorted(missing))}: nothing is left to "
-                               f"{'see' if not seen else 'predict'} for a model with camera {model.camera}, lidar "
-                               f"{model.lidar} and heads {', '.join(model.heads)}. Choose other ones.")
-    changes: dict = dict.fromkeys(missing, config_lib.NO_SENSOR)
+                               f"{'see' if not seen else 'predict'} for the model {model.variant} with the heads "
+                               f"{', '.join(model.heads)}. Choose other ones.")
+    changes: dict = dict.fromkeys(missing)
     return dataclasses.replace(model, heads=kept, **changes)
 
 
@@ -321,11 +319,15 @@ def _image_size(camera: schema.Camera, columns: int) -> tuple[int, int]:
     return rows // _SIDE_MULTIPLE * _SIDE_MULTIPLE, columns
 
 
-def _occupancy_blocks(wanted: int, grid: config_lib.VoxelGrid) -> int:
-    """The most full-width decoder stages, up to `wanted`, that halve down to whole voxels."""
-    for blocks in range(wanted, -1, -1):
+def _fit_voxel_decoder(latent: config_lib.VectorLatent, grid: config_lib.VoxelGrid,
+                       notes: list[str]) -> config_lib.VectorLatent:
+    """With the most full-width decoder stages, up to those it has, that halve down to whole voxels."""
+    for blocks in range(latent.occupancy_blocks, -1, -1):
         if all(side % 2 ** (blocks + 3) == 0 for side in grid.shape):
-            return blocks
+            if blocks != latent.occupancy_blocks:
+                notes.append(f"the voxel decoder has {blocks} full-width stages instead of {latent.occupancy_blocks}: "
+                             f"the recorded grid is only {_by(grid.shape)}.")
+            return dataclasses.replace(latent, occupancy_blocks=blocks)
     raise schema.DataError(f"the recorded voxel grid of {_by(grid.shape)} does not suit the voxel decoder: each "
                            f"side must be a multiple of 8. Record another grid, or leave the occupancy head out.")
 

@@ -1,4 +1,4 @@
-"""Decoders that see the memory: a U-net whose deepest map is the latent's (model.first_guess="last_seen").
+"""Decoders that see the memory: a U-net whose deepest map is the latent's (config.LastSeen).
 
 On the way down it reads the memory as it looks from the state's vantage, on the way up it draws what must be added to
 that, where it covers anything, and to the average training frame elsewhere. So a fresh model predicts the moved memory
@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 from flax import linen
 
-from muvo_jax.config import ModelConfig
+from muvo_jax.config import LastSeen, ModelConfig, as_kind
 from muvo_jax.model import common, memory, outputs, tokens
 from muvo_jax.nn import layers
 from muvo_jax.ops import conv_cpu, resample
@@ -50,7 +50,8 @@ class GuidedDecoder(linen.Module):
     @linen.compact
     def __call__(self, features: jax.Array, seen: jax.Array, numbers: jax.Array) -> dict[int, jax.Array]:
         config, compute = self.config, common.compute(self.config)
-        width = config.guided_channels[("image", "range_view", "occupancy").index(self.head)]
+        widths = as_kind(config.first_guess, LastSeen).guided_channels
+        width = widths[("image", "range_view", "occupancy").index(self.head)]
         dense = lambda name, x, features: layers.Dense(features, compute, name=name)(x)
         conv = lambda name, x, features: _activation(layers.Conv(features, (3, 3), compute, name=name)(x))
         # Doubling and halving by dense layers on 2x2 pixels: whole matrix products, on any backend.

@@ -1,4 +1,4 @@
-"""What was seen of late and how it looks from where a state is: the geometric memory (first_guess="last_seen").
+"""What was seen of late and how it looks from where a state is: the geometric memory (config.LastSeen).
 
 Moving what the sensors showed by the motion of the car needs no learning, and says most of what the next frames show.
 So a model with this memory keeps its last observations as they came (types.Memory, beside the states, once for all
@@ -15,7 +15,7 @@ import flax.struct
 import jax
 import jax.numpy as jnp
 
-from muvo_jax.config import NO_SENSOR, ModelConfig
+from muvo_jax.config import LastSeen, ModelConfig, as_kind
 from muvo_jax.geometry import VoxelGrid
 from muvo_jax.ops import motion as motion_ops
 from muvo_jax.ops import reproject
@@ -73,9 +73,9 @@ Glimpse = ImageGlimpse | RangeGlimpse | VoxelGlimpse
 
 def guessed_heads(config: ModelConfig) -> tuple[str, ...]:
     """The heads whose decoders see the memory: what cannot be moved (nothing moves without ranges) is not guessed."""
-    if config.first_guess != "last_seen" or config.lidar == NO_SENSOR:
+    if not isinstance(config.first_guess, LastSeen) or config.lidar is None:
         return ()
-    seen = ("image",) if config.camera != NO_SENSOR else ()
+    seen = ("image",) if config.camera is not None else ()
     return tuple(head for head in (*seen, "range_view", "occupancy") if head in config.heads)
 
 
@@ -95,7 +95,8 @@ def stream_places(config: ModelConfig) -> int:
 
     That one is hidden from the decoders of its own state, which look at as many before it, as those of a window do.
     """
-    return config.memory_frames + 1
+    guess = config.first_guess
+    return (guess.memory_frames if isinstance(guess, LastSeen) else 0) + 1
 
 
 def initial_vantage(config: ModelConfig, batch_size: int) -> Vantage:
@@ -251,7 +252,7 @@ def look(config: ModelConfig, memory: Memory, rows: Array, vantage: Vantage,
       heads: what is decoded.
     """
     heads = tuple(head for head in guessed_heads(config) if head in heads)
-    places = config.memory_frames
+    places = as_kind(config.first_guess, LastSeen).memory_frames
     stop = vantage.last + (vantage.steps > 0)
     index = stop[:, None] + jnp.arange(-places, 0, dtype=jnp.int32)[None]
     known = (index >= vantage.first[:, None]) & (index >= 0)
@@ -336,7 +337,7 @@ def with_evidence(config: ModelConfig, memory: Memory | None, vantage: Vantage |
     """
     if memory is None or vantage is None or "occupancy" not in config.heads:
         return memory
-    places, rows = config.memory_frames, jnp.arange(memory.pose.shape[0])
+    places, rows = as_kind(config.first_guess, LastSeen).memory_frames, jnp.arange(memory.pose.shape[0])
     newest = memory.pose.shape[1] + jnp.arange(-places, 0, dtype=jnp.int32)
     index = jnp.broadcast_to(newest[None], (rows.shape[0], places))
     known = (index >= vantage.first[:, None]) & (index >= 0)

@@ -131,7 +131,7 @@ def test_only_damaged_checkpoints_is_an_error(tmp_path, fresh, config):
 
 def test_another_architecture_is_refused_by_naming_both(tmp_path, fresh, config):
     _save(tmp_path, fresh, config, 1).close()
-    other = dataclasses.replace(config, preset="other", model=dataclasses.replace(config.model, embedding_channels=24))
+    other = config_lib.override(dataclasses.replace(config, preset="other"), "model.latent.embedding_channels", 24)
     with pytest.raises(ValueError, match=r"preset 'tiny'.*preset 'other'.*embedding_channels 16 \(stored\) against 24"):
         checkpoint.Checkpoints(tmp_path).restore_latest(fresh, other)
 

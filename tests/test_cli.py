@@ -173,6 +173,8 @@ def test_an_unknown_option_names_its_neighbours(capsys):
     (["--occupancy", "--no-occupancy"], "contradict each other"),
     (["--set", "model.dropot=0"], "'dropot' is unknown"),
     (["--set", "model.dropout"], "expected name=value"),
+    (["--set", "model.memory_frames=3"], "model.memory_frames is called model.first_guess.memory_frames now"),
+    (["--set", "model.latent.aligned_tokens=true"], "is a setting of model.latent=2d (TokenLatent)"),
     (["--set", "train.steps=many"], "train.steps: got 'many', expected int"),
     (["--data=/nowhere/at/all"], "data folder /nowhere/at/all does not exist"),
     (["--name=ghost", "--resume"], "no run to go on with"),

@@ -2,9 +2,13 @@
 
     whole.py      Config: the model, the loss, the data, training, evaluation and what actions mean
     model.py      ModelConfig, made of the parts of parts.py: a setting exists only where it acts
+    parts.py      VectorLatent or TokenLatent, RangeViewLidar or PillarLidar, and so on
     sizes.py      what a part is like in each preset, for a model that changes one
     settings.py   one setting by its dotted name, as --set gives it
     migration.py  config.json of earlier versions
+    parsing.py    frozen dataclasses from JSON
+
+heads.py, contract.py, training.py and augmentation.py have the other sections.
 """
 
 from muvo_jax.config.augmentation import AugmentationConfig

@@ -62,5 +62,5 @@ def test_variants_are_recognised_by_their_keys_and_shapes(name):
 
 def test_the_grid_of_a_birds_eye_camera_comes_from_the_checkpoint():
     matrix = np.array([[2.0, 0, 16], [0, -2.0, 32], [0, 0, 1]], np.float32)
-    grid = checkpoints.recognise(stored("RV_BEV_FC", **{"frustum_pooling.bev_intrinsics": matrix})).birds_eye
+    grid = checkpoints.recognise(stored("RV_BEV_FC", **{"frustum_pooling.bev_intrinsics": matrix})).camera.grid
     assert (grid.cells, grid.cell_m, grid.cells_behind) == (64, 0.5, 16)

@@ -357,17 +357,11 @@ def test_banks_without_their_memory_are_refused():
         environment_of(model, forgetful, batch)
 
 
-def test_the_configuration_survives_json_and_pickling_and_old_files_have_none_of_it():
+def test_the_configuration_survives_json_and_pickling():
     config = config_of()
     assert config.model.kinematics == config_lib.Kinematics(config.contract, config.data.stride)
     assert config_lib.Config.from_dict(json.loads(json.dumps(config.to_dict()))) == config
     assert pickle.loads(pickle.dumps(config)) == config and hash(config.model) == hash(config_of().model)
-    old = presets.paper().to_dict()
-    for field in ("first_guess", "action_path", "kinematics"):
-        del old["model"][field]
-    for section, field in (("train", "restart"), ("augmentation", "mirror"), ("augmentation", "light")):
-        del old[section][field]
-    assert config_lib.Config.from_dict(old) == presets.paper()
     assert not presets.paper().model.tracks_motion and presets.town().model.kinematics.periods == 2
 
 

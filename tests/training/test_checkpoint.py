@@ -136,6 +136,15 @@ def test_another_architecture_is_refused_by_naming_both(tmp_path, fresh, config)
         checkpoint.Checkpoints(tmp_path).restore_latest(fresh, other)
 
 
+def test_a_checkpoint_with_the_config_of_version_1_is_read(tmp_path, fresh, config, monkeypatch):
+    kept = json.loads((pathlib.Path(__file__).parents[1] / "kept_runs/tiny-tr.json").read_text())
+    with monkeypatch.context() as patch:
+        patch.setattr(config_lib.Config, "to_dict", lambda self: kept)
+        _save(tmp_path, fresh, config, 1).close()
+    assert checkpoint.load_run(tmp_path).config == presets.tiny()
+    assert checkpoint.Checkpoints(tmp_path).restore_latest(fresh, config).step == 1
+
+
 def test_keeps_the_last_and_the_best(tmp_path, fresh, config):
     keeper = checkpoint.Checkpoints(tmp_path, keep_last=2, keep_best=1)
     for step, score in ((1, 0.0), (2, 5.0), (3, 1.0), (4, None), (5, 2.0)):

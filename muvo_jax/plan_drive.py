@@ -168,10 +168,10 @@ def observation(town: simulator.Town, state: simulator.TownState, config: config
     seen = town.render(state)
     fields = {"image": seen["image"], "range_view": seen["range_view"], "route_map": seen["route_map"],
               "speed_mps": np.float32(seen["speed_mps"])}
-    if config.model.lidar == "pp":
-        fields["points"], fields["point_count"] = prepare.padded_points(seen["points_m"], config.model.pillars.points,
-                                                                        0)
-    if config.model.camera == "bev" or config.model.first_guess == "last_seen":
+    lidar, camera, guess = config.model.lidar, config.model.camera, config.model.first_guess
+    if isinstance(lidar, config_lib.PillarLidar):
+        fields["points"], fields["point_count"] = prepare.padded_points(seen["points_m"], lidar.grid.points, 0)
+    if isinstance(camera, config_lib.BirdsEyeCamera) or isinstance(guess, config_lib.LastSeen):
         fields |= {"intrinsics": town.renderer.intrinsics, "camera_to_ego": town.renderer.camera_to_ego}
     return fields
 

@@ -10,17 +10,13 @@ import pytest
 import muvo_jax
 
 PACKAGE = pathlib.Path(muvo_jax.__file__).parent
-BASE = {"types", "config", "config_augmentation", "config_heads", "config_json", "geometry", "limits",
-        "ops"}
+BASE = {"types", "config", "geometry", "limits", "ops"}
 ALLOWED = {
     "types": set(),
     "limits": set(),
-    "config_augmentation": {"limits"},
-    "config_heads": {"limits"},
-    "config_json": {"limits"},
     "geometry": {"limits"},
     "late": set(),
-    "config": {"config_augmentation", "config_heads", "config_json", "geometry", "limits"},
+    "config": {"geometry", "limits"},
     "presets": {"config"},
     "ops": {"types", "config", "geometry"},
     "nn": BASE,

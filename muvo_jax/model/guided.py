@@ -1,4 +1,4 @@
-"""Decoders that see the memory: a U-net whose deepest map is the latent's (model.first_guess="last_seen").
+"""Decoders that see the memory: a U-net whose deepest map is the latent's (config.LastSeen).
 
 On the way down it reads the memory as it looks from the state's vantage, on the way up it draws what must be added to
 that, where it covers anything, and to the average training frame elsewhere. So a fresh model predicts the moved memory
@@ -16,7 +16,7 @@ import jax
 import jax.numpy as jnp
 from flax import linen
 
-from muvo_jax.config import ModelConfig
+from muvo_jax.config import LastSeen, ModelConfig, as_kind
 from muvo_jax.model import common, outputs, tokens
 from muvo_jax.model import glimpse as glimpse_lib
 from muvo_jax.nn import layers
@@ -48,7 +48,7 @@ class GuidedDecoder(linen.Module):
     @linen.compact
     def __call__(self, features: jax.Array, seen: jax.Array, numbers: jax.Array) -> dict[int, jax.Array]:
         config, compute, part = self.config, common.compute(self.config), PARTS[self.head]
-        width = part.width(config)
+        width = as_kind(config.first_guess, LastSeen).guided_channels[part.width]
         dense = lambda name, x, features: layers.Dense(features, compute, name=name)(x)
         conv = lambda name, x, features: _activation(layers.Conv(features, (3, 3), compute, name=name)(x))
         # Doubling and halving by dense layers on 2x2 pixels: whole matrix products, on any backend.
@@ -65,13 +65,13 @@ class GuidedDecoder(linen.Module):
         for scale in (4, 2):
             x = grow(f"grow_{scale}", x, width // _WIDTHS[scale])
             x = conv(f"draw_{scale}", jnp.concatenate([x, down[scale]], axis=-1), width // _WIDTHS[scale])
-            out[scale] = dense(f"head_{scale}", x, part.outputs(config, scale)).astype(jnp.float32)
+            out[scale] = dense(f"head_{scale}", x, part.channels(config, scale)).astype(jnp.float32)
         # Full size is drawn in blocks of 2x2 pixels: a quarter of the places, with channels enough for a fast product.
         seen = conv_cpu.space_to_depth(down[1], (2, 2))
         x = conv("draw_1", jnp.concatenate([x, seen], axis=-1), width // _WIDTHS[2])
-        blocks = dense("head_1", x, 4 * part.outputs(config, 1))
+        blocks = dense("head_1", x, 4 * part.channels(config, 1))
         if part.blurs:
-            blocks = blocks + layers.Conv(4 * part.outputs(config, 1), (3, 3), compute, name="blur")(seen)
+            blocks = blocks + layers.Conv(4 * part.channels(config, 1), (3, 3), compute, name="blur")(seen)
         return {1: conv_cpu.depth_to_space(blocks.astype(jnp.float32), (2, 2)), **out}
 
     def _latent(self, features: jax.Array, width: int) -> jax.Array:
@@ -187,8 +187,8 @@ class Part:
 
     Attributes:
       plane: full size; the ground plan of the voxels, whose heights are channels.
-      width: of the decoder.
-      outputs: channels at a scale.
+      width: place of the decoder's width in LastSeen.guided_channels.
+      channels: of the drawn map at a scale.
       shrink: sides of the deepest map are those of the plane over this, where a vector is unfolded to it.
       see: what the memory shows, as input channels.
       compose: what is drawn, put upon what the memory shows and upon the average frame.
@@ -198,8 +198,8 @@ class Part:
     """
 
     plane: Callable[[ModelConfig], tuple[int, int]]
-    width: Callable[[ModelConfig], int]
-    outputs: Callable[[ModelConfig, int], int]
+    width: int
+    channels: Callable[[ModelConfig, int], int]
     shrink: int
     see: Callable[[Any, ModelConfig], jax.Array]
     compose: Callable[[dict[int, jax.Array], Any, outputs.FirstGuess, ModelConfig], dict[int, jax.Array]]
@@ -207,11 +207,10 @@ class Part:
 
 
 PARTS = {
-    "image": Part(lambda config: config.image_size, lambda config: config.guided_channels[0], lambda config, scale: 3,
-                  tokens.IMAGE_SHRINK, _see_image, _compose_image, blurs=True),
-    "range_view": Part(lambda config: (config.range_view.rows, config.range_view.columns),
-                       lambda config: config.guided_channels[1], lambda config, scale: 5, tokens.RANGE_VIEW_SHRINK,
-                       _see_ranges, _compose_ranges),
-    "occupancy": Part(lambda config: config.voxels.shape[:2], lambda config: config.guided_channels[2],
+    "image": Part(lambda config: config.image_size, 0, lambda config, scale: 3, tokens.IMAGE_SHRINK, _see_image,
+                  _compose_image, blurs=True),
+    "range_view": Part(lambda config: (config.range_view.rows, config.range_view.columns), 1, lambda config, scale: 5,
+                       tokens.RANGE_VIEW_SHRINK, _see_ranges, _compose_ranges),
+    "occupancy": Part(lambda config: config.voxels.shape[:2], 2,
                       lambda config, scale: 2 * config.voxels.shape[2] // scale, 8, _see_voxels, _compose_voxels),
 }

@@ -1,6 +1,6 @@
 """The one table of what is decoded: a head's name, its decoder, channels, scales, tokens, unit and first guess.
 
-config_heads.py says what a head is compared with, objectives/terms.py how, and what a new head takes.
+config/heads.py says what a head is compared with, objectives/terms.py how, and what a new head takes.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from collections.abc import Callable
 
 from flax import linen
 
-from muvo_jax.config import BIRDS_EYE_CLASSES, EGO_MOTION_UNITS, ModelConfig
+from muvo_jax.config import BIRDS_EYE_CLASSES, EGO_MOTION_UNITS, ModelConfig, TokenLatent, ZeroGuess
 from muvo_jax.model import common, decoders, memory, outputs, token_decoders, tokens
 
 
@@ -42,7 +42,7 @@ class Head:
 
 def _plane(config: ModelConfig, channels: int, size: tuple[int, int], token_shrink: int) -> linen.Module:
     width = config.decoder_channels
-    if config.latent == "2d":
+    if isinstance(config.latent, TokenLatent):
         stages = token_shrink.bit_length() - 4  # three more doublings end in an output each
         return token_decoders.TokenDecoder(channels, width, width, stages, common.compute(config))
     return decoders.PlaneDecoder(size, channels, width, common.compute(config))
@@ -59,19 +59,19 @@ def _range_view(config: ModelConfig, channels: int) -> linen.Module:
 
 def _occupancy(config: ModelConfig, channels: int) -> linen.Module:
     width = config.occupancy_channels
-    if config.latent == "2d":
-        return token_decoders.TokenDecoder(channels, 2 * width, width, config.occupancy_token_stages,
+    if isinstance(config.latent, TokenLatent):
+        return token_decoders.TokenDecoder(channels, 2 * width, width, config.latent.occupancy_token_stages,
                                            common.compute(config))
-    return decoders.StyledDecoder(config.voxels.shape, channels, 2 * width, width, config.occupancy_blocks,
+    return decoders.StyledDecoder(config.voxels.shape, channels, 2 * width, width, config.latent.occupancy_blocks,
                                   compute=common.compute(config))
 
 
 def _birds_eye(config: ModelConfig, channels: int) -> linen.Module:
     width, compute, head = config.decoder_channels, common.compute(config), decoders.BirdsEyeHead
-    if config.latent == "2d":
-        return token_decoders.TokenDecoder(channels, width, width, config.occupancy_token_stages, compute, head,
+    if isinstance(config.latent, TokenLatent):
+        return token_decoders.TokenDecoder(channels, width, width, config.latent.occupancy_token_stages, compute, head,
                                            flat=True)
-    return decoders.StyledDecoder(config.voxels.shape[:2], channels, width, width, config.occupancy_blocks, head,
+    return decoders.StyledDecoder(config.voxels.shape[:2], channels, width, width, config.latent.occupancy_blocks, head,
                                   compute)
 
 
@@ -119,7 +119,7 @@ def initial_constants(config: ModelConfig) -> dict[str, float]:
             path = f"decoders_{name}/{'decoder/' if name in guessed else ''}head_{scale}"
             if name in guessed and name == "image" and scale == 1:
                 values[f"decoders_{name}/decoder/blur/kernel"] = 0.0
-            if config.first_guess != "zero" and name in outputs.FIRST_GUESS_HEADS:
+            if not isinstance(config.first_guess, ZeroGuess) and name in outputs.FIRST_GUESS_HEADS:
                 values |= {f"{path}/bias": 0.0, f"{path}/kernel": 0.0}
             else:
                 values[f"{path}/bias"] = head.initial_bias

@@ -1,4 +1,4 @@
-"""What was seen of late, and where a state stands to it: the geometric memory (first_guess="last_seen").
+"""What was seen of late, and where a state stands to it: the geometric memory (config.LastSeen).
 
 Moving what the sensors showed by the motion of the car needs no learning, and says most of what the next frames show.
 So a model with this memory keeps its last observations as they came (types.Memory, beside the states, once for all
@@ -13,16 +13,16 @@ import dataclasses
 import jax
 import jax.numpy as jnp
 
-from muvo_jax.config import NO_SENSOR, ModelConfig
+from muvo_jax.config import LastSeen, ModelConfig
 from muvo_jax.ops import motion as motion_ops
 from muvo_jax.types import UNTIMED_FIELDS, Array, Batch, LatentState, Memory, Motion, Vantage
 
 
 def guessed_heads(config: ModelConfig) -> tuple[str, ...]:
     """The heads whose decoders see the memory: what cannot be moved (nothing moves without ranges) is not guessed."""
-    if config.first_guess != "last_seen" or config.lidar == NO_SENSOR:
+    if not isinstance(config.first_guess, LastSeen) or config.lidar is None:
         return ()
-    seen = ("image",) if config.camera != NO_SENSOR else ()
+    seen = ("image",) if config.camera is not None else ()
     return tuple(head for head in (*seen, "range_view", "occupancy") if head in config.heads)
 
 
@@ -42,7 +42,8 @@ def stream_places(config: ModelConfig) -> int:
 
     That one is hidden from the decoders of its own state, which look at as many before it, as those of a window do.
     """
-    return config.memory_frames + 1
+    guess = config.first_guess
+    return (guess.memory_frames if isinstance(guess, LastSeen) else 0) + 1
 
 
 def initial_vantage(config: ModelConfig, batch_size: int) -> Vantage:

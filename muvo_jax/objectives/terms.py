@@ -1,7 +1,7 @@
 """The one table of loss terms: for each head how they are computed and what weighs them.
 
 A term is reduced to sums that add over samples and devices; `total` adds them over devices and asks each for its value
-only then. What a new head takes is written in config_heads.py.
+only then. What a new head takes is written in config/heads.py.
 """
 
 from __future__ import annotations

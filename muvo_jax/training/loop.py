@@ -160,7 +160,7 @@ def _introduce(job: Job, show: screen.Screen, config: config_lib.Config, ready: 
     frame_s = data.stride / config.contract.rate_hz
     show.field("windows", f"{windows} of {data.frames} frames, {frame_s:g} s apart; then {data.context} observed and "
                           f"{data.horizon} imagined in evaluation")
-    show.field("model", f"{config.model.variant} ({config.model.latent}), {ready.parameters:,} parameters, heads "
+    show.field("model", f"{config.model.variant} ({config.model.latent.kind}), {ready.parameters:,} parameters, heads "
                         f"{', '.join(config.model.heads)}")
     extra = f" x {accumulate} accumulated" if accumulate > 1 else ""
     batch = words.counted(config.train.batch, "window")

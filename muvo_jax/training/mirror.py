@@ -90,7 +90,7 @@ def check(model: config_lib.ModelConfig) -> None:
     if not {"occupancy", "birds_eye"}.isdisjoint(model.heads) and abs(middle_m) > _SYMMETRIC_M:
         aside = f"the middle of model.voxels lies at y = {middle_m:g} m"
     lidar_m = model.range_view.position_m[1]
-    seen = model.lidar != config_lib.NO_SENSOR or not {"range_view", "semantic_range_view"}.isdisjoint(model.heads)
+    seen = model.lidar is not None or not {"range_view", "semantic_range_view"}.isdisjoint(model.heads)
     if seen and abs(lidar_m) > _SYMMETRIC_M:
         aside = f"the lidar (model.range_view.position_m) lies at y = {lidar_m:g} m"
     if aside:

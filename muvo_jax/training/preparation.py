@@ -75,9 +75,9 @@ def expected_batch(config: config_lib.Config, windows: int, *,
         return jax.ShapeDtypeStruct((*prefix, *shape), dtype)
 
     fields = {name: timed(types.BATCH_FIELDS[name][0], *sizes) for name, sizes in world_model.inputs(model).items()}
-    if model.lidar != config_lib.NO_SENSOR:
+    if model.lidar is not None:
         fields["range_view"] = timed(np.float32, model.range_view.rows, model.range_view.columns, 4)
-    if model.camera != config_lib.NO_SENSOR or "image" in config.targets:
+    if model.camera is not None or "image" in config.targets:
         fields |= {"intrinsics": shape(np.float32, 3, 3), "camera_to_ego": shape(np.float32, 4, 4)}
     fields |= {name: timed(types.BATCH_FIELDS[name][0], *sizes) for name, sizes in config.targets.items()}
     fields |= {name: timed(types.BATCH_FIELDS[name][0]) for name in sorted(TOWN_RECORDS.intersection(recorded))}

@@ -6,6 +6,7 @@ import pytest
 import worlds
 
 from muvo_jax import command_line, plan_drive, presets
+from muvo_jax import config as config_lib
 from muvo_jax.agents import closed_loop, planners, sensitivity
 from muvo_jax.model import world_model
 from muvo_jax.town import settings
@@ -119,7 +120,7 @@ def test_the_town_gives_what_the_model_reads_at_the_models_rate():
     assert seen["image"].shape == (*config.model.image_size, 3) and seen["image"].dtype == np.uint8
     assert seen["range_view"].shape == (config.model.range_view.rows, config.model.range_view.columns, 4)
     assert seen["route_map"].shape == (64, 64)
-    lifted = dataclasses.replace(config, model=dataclasses.replace(config.model, camera="bev"))
+    lifted = config_lib.override(config, "model.camera", "bev")
     assert set(plan_drive.observation(town, state, lifted)) >= set(world_model.inputs(lifted.model))
 
 

@@ -8,6 +8,8 @@ import numpy as np
 import pytest
 from worlds import CONFIG, HORIZON, MODEL, NO_COLLISION, STARTS, bank, make, variables
 
+from muvo_jax import config as config_lib
+from muvo_jax import presets
 from muvo_jax.agents import environment as environment_lib
 from muvo_jax.agents import rewards
 from muvo_jax.model import rollout, world_model
@@ -41,7 +43,8 @@ def test_without_noise_a_step_is_the_models_and_the_car_moves_by_its_kinematics(
 
 
 def test_the_2d_latent_is_driven_by_a_policy_that_reads_one_vector():
-    model = world_model.WorldModel(dataclasses.replace(CONFIG, latent="2d", heads=("action",)))
+    model = world_model.WorldModel(config_lib.override_all(presets.get("tiny"), {
+        "model.latent": "2d", "model.heads": ("action",)}).model)
     draw = lambda leaf: jax.random.normal(jax.random.key(leaf.size), leaf.shape)
     starts = environment_lib.StartBank(jax.tree.map(draw, model.initial_state(STARTS)), bank().speed_mps,
                                        bank().route_map)

@@ -1,6 +1,5 @@
 """From a checkpoint of the authors to a run and back, without torch; what does not fit is named and leaves nothing."""
 
-import dataclasses
 import json
 import resource
 import time
@@ -19,8 +18,9 @@ from muvo_jax.model import world_model
 from muvo_jax.training import checkpoint, screen
 
 # The tiny preset, with two things that no checkpoint tells as they are by default.
-TINY = dataclasses.replace(presets.get("tiny").model, numerics="reference", transformer_heads=8, token_channels=24,
-                           image_size=(64, 128), range_view=config_lib.RangeViewGeometry(rows=64, columns=64))
+TINY = config_lib.override_all(presets.get("tiny"), {
+    "model.numerics": "reference", "model.fusion.heads": 8, "model.fusion.token_channels": 24,
+    "model.image_size": (64, 128), "model.range_view": config_lib.RangeViewGeometry(rows=64, columns=64)})
 
 
 def drawn_variables(config):
@@ -46,12 +46,12 @@ def checkpoint_of(state_dict):
 
 
 @pytest.fixture(scope="module", params=[
-    {}, {"latent": "2d", "backbone": "mobilevitv2_100"},
-    {"lidar": "pp", "camera": "bev", "fusion": "fc", "navigation": True,
-     "heads": ("image", "range_view", "action", "birds_eye")}], ids=["1d", "2d-mobilevit", "fc"])
+    {}, {"model.latent": "2d", "model.backbone": "mobilevitv2_100"},
+    {"model.lidar": "pp", "model.camera": "bev", "model.fusion": "fc", "model.navigation": True,
+     "model.heads": ("image", "range_view", "action", "birds_eye")}], ids=["1d", "2d-mobilevit", "fc"])
 def tiny(request):
     """Configuration, variables and state_dict of a small model."""
-    config = dataclasses.replace(TINY, **request.param)
+    config = config_lib.override_all(TINY, request.param).model
     variables = drawn_variables(config)
     return config, variables, names.reference_state_dict(variables, config)
 

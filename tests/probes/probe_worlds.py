@@ -21,6 +21,10 @@ FRAMES, SEEN = 6, 2  # of a window: all, and those that are observed
 WINDOWS, BATCHES = 16, 64  # in a batch, and batches that differ
 SIDE_PX = 32
 GEOMETRY = config_lib.RangeViewGeometry(rows=SIDE_PX, columns=SIDE_PX)
+LATENTS = {"1d": config_lib.VectorLatent(embedding_channels=32, fused_channels=32, keep_cells=True,
+                                         deterministic_channels=32, stochastic_channels=16, action_channels=8,
+                                         occupancy_blocks=1),
+           "2d": config_lib.TokenLatent(transition_layers=1, aligned_tokens=True, occupancy_token_stages=0)}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -28,8 +32,8 @@ class Bar:
     """A bright bar in a dark picture; steering moves it sideways by up to 4 pixels a step. The state is its place."""
 
     head: str = "image"
-    camera: str = "wob"
-    lidar: str = "none"
+    camera: config_lib.PlaneCamera | None = config_lib.PlaneCamera()
+    lidar: config_lib.RangeViewLidar | None = None
     contrast: tuple = ((0.0, -0.5), (0.0, 0.5))
 
     def starts(self, generator, count):
@@ -55,8 +59,8 @@ class Wall:
     """A round wall; the throttle brings it nearer by up to 5 m a step. The state is its distance."""
 
     head: str = "range_view"
-    camera: str = "none"
-    lidar: str = "rv"
+    camera: config_lib.PlaneCamera | None = None
+    lidar: config_lib.RangeViewLidar | None = config_lib.RangeViewLidar()
     contrast: tuple = ((-0.5, 0.0), (0.5, 0.0))
 
     def starts(self, generator, count):
@@ -81,10 +85,9 @@ def config_of(world, latent, steps=200, **model):
     """A small model of the sensor that the world has; `model` changes fields of ModelConfig."""
     tiny = presets.tiny()
     small = dataclasses.replace(
-        tiny.model, latent=latent, heads=(world.head,), camera=world.camera, lidar=world.lidar, route=False,
-        speed=False, image_size=(SIDE_PX, SIDE_PX), range_view=GEOMETRY, backbone_width=8, token_channels=24,
-        transformer_hidden_channels=48, fused_channels=32, embedding_channels=32, deterministic_channels=32,
-        stochastic_channels=16, decoder_channels=16, keep_cells=True, aligned_tokens=latent == "2d", dropout=0.0,
+        tiny.model, latent=LATENTS[latent], heads=(world.head,), camera=world.camera, lidar=world.lidar, route=False,
+        speed=False, image_size=(SIDE_PX, SIDE_PX), range_view=GEOMETRY, backbone_width=8, decoder_channels=16,
+        fusion=config_lib.TransformerFusion(token_channels=24, layers=1, heads=2, hidden_channels=48, dropout=0.0),
         **{"prior_dropout": 0.0, **model})
     return dataclasses.replace(
         tiny, model=small,

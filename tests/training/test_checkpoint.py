@@ -131,9 +131,18 @@ def test_only_damaged_checkpoints_is_an_error(tmp_path, fresh, config):
 
 def test_another_architecture_is_refused_by_naming_both(tmp_path, fresh, config):
     _save(tmp_path, fresh, config, 1).close()
-    other = dataclasses.replace(config, preset="other", model=dataclasses.replace(config.model, embedding_channels=24))
+    other = config_lib.override(dataclasses.replace(config, preset="other"), "model.latent.embedding_channels", 24)
     with pytest.raises(ValueError, match=r"preset 'tiny'.*preset 'other'.*embedding_channels 16 \(stored\) against 24"):
         checkpoint.Checkpoints(tmp_path).restore_latest(fresh, other)
+
+
+def test_a_checkpoint_with_the_config_of_version_1_is_read(tmp_path, fresh, config, monkeypatch):
+    kept = json.loads((pathlib.Path(__file__).parents[1] / "kept_runs/tiny-tr.json").read_text())
+    with monkeypatch.context() as patch:
+        patch.setattr(config_lib.Config, "to_dict", lambda self: kept)
+        _save(tmp_path, fresh, config, 1).close()
+    assert checkpoint.load_run(tmp_path).config == presets.tiny()
+    assert checkpoint.Checkpoints(tmp_path).restore_latest(fresh, config).step == 1
 
 
 def test_keeps_the_last_and_the_best(tmp_path, fresh, config):

@@ -52,7 +52,8 @@ def _step(context: cases.Context) -> Checks:
     latent = "2d" if context.file.path.stem.endswith("2d") else "1d"
     shape = context.shape("out/throttle_brake", "out/steering", "out/posterior/mu")
     frames = shape[1] if shape else context.size("p5", f"train_step_{latent}_sequence")
-    config = config_lib.ModelConfig(latent=latent, numerics="reference", dropout=0.0, prior_dropout=0.0)
+    config = config_lib.ModelConfig(latent=config_lib.LATENTS[latent](), numerics="reference", prior_dropout=0.0,
+                                    fusion=config_lib.TransformerFusion(dropout=0.0))
     model = world_model.WorldModel(config)
     variables = jax.tree.map(jnp.asarray, drawing.draw_variables(model.variable_shapes()))
     batch = raw_batch.model_batch(raw_batch.draw_raw(context, frames, context.size("p4", "imagine")))

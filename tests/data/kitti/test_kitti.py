@@ -116,8 +116,8 @@ def test_a_sensor_may_be_missing_altogether(drive, absent, modality):
     assert (recording.description.lidar is None) == (absent == "velodyne_points")
     assert (recording.description.camera is None) == (absent == "image_02")
     model = fitting.adapt(config_lib.override(presets.get("tiny"), "data.stride", 1), recording).config.model
-    assert (model.camera == "none", model.lidar == "none") == (absent == "image_02", absent == "velodyne_points")
-    assert model.heads == (("range_view", "occupancy", "action") if model.camera == "none" else ("image", "action"))
+    assert (model.camera is None, model.lidar is None) == (absent == "image_02", absent == "velodyne_points")
+    assert model.heads == (("range_view", "occupancy", "action") if model.camera is None else ("image", "action"))
 
 
 def test_a_drive_without_image_and_scan_is_refused(drive):

@@ -315,6 +315,8 @@ class TrainConfig:
       parallel: "auto" uses shard_map over all devices where there is more than one.
       backbone_weights: file of an image network that fresh encoders start from; "" for none.
       perceptual_from: such a file, or a run whose image encoder is taken, for the perceptual term; "" for none.
+      trainable: paths of the parameters that train, as patterns separated by commas: "decoders_*" trains the decoders
+        alone, "!camera" all but the camera's encoder, "*" everything (see training/trainable.py).
     """
 
     steps: Annotated[int, COUNT] = 50_000
@@ -334,6 +336,7 @@ class TrainConfig:
     restart: bool = False
     backbone_weights: str = ""
     perceptual_from: str = ""
+    trainable: str = "*"
 
     def __post_init__(self):
         check(self)

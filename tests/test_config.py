@@ -130,7 +130,8 @@ def test_version_1_from_before_it_had_all_of_its_fields_and_what_never_was():
 def test_every_moved_setting_has_a_place_today():
     places = {f"{part}.{field.name}" for part, (hint, _) in migration._PARTS.items()
               for cls in parts.kinds(hint).values() for field in dataclasses.fields(cls) if field.init}
-    assert set(migration.MOVED.values()) == places
+    later = {"first_guess.follow_movers"}  # version 1 had nothing of the kind
+    assert set(migration.MOVED.values()) == places - later
     fields = {field.name for field in dataclasses.fields(config_lib.ModelConfig)}
     assert fields.isdisjoint(migration.MOVED) and fields >= migration._PARTS.keys()
 

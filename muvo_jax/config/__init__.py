@@ -51,11 +51,10 @@ from muvo_jax.config.training import DataConfig, EvaluationConfig, OptimizerConf
 from muvo_jax.config.whole import Config
 from muvo_jax.geometry import BirdsEyeGrid, PillarGrid, RangeViewGeometry, RouteMap, VoxelGrid
 
-__all__ = ["ALL_HEADS", "BACKBONES", "BIRDS_EYE_CLASSES", "CAMERAS", "EGO_MOTION_UNITS", "FLOW_LAGS", "FUSIONS", "HEADS",
-           "LATENTS",
-           "LIDARS", "NO_SENSOR", "RATE_HZ", "TARGETS", "TERM_TARGETS", "ActionContract", "AugmentationConfig",
-           "AverageFusion", "BirdsEyeCamera", "BirdsEyeGrid", "ConcatenationFusion", "Config", "DataConfig",
-           "EvaluationConfig", "Kinematics", "LastSeen", "LossConfig", "ModelConfig", "OptimizerConfig", "PillarGrid",
-           "PillarLidar", "PlaneCamera", "RangeViewGeometry", "RangeViewLidar", "RouteMap", "TokenLatent",
-           "TrainConfig", "TrainingMean", "TransformerFusion", "VectorLatent", "VoxelGrid", "ZeroGuess", "as_kind",
-           "check_choice", "head_targets", "override", "override_all", "parse"]
+__all__ = ["ALL_HEADS", "BACKBONES", "BIRDS_EYE_CLASSES", "CAMERAS", "EGO_MOTION_UNITS", "FLOW_LAGS", "FUSIONS",
+           "HEADS", "LATENTS", "LIDARS", "NO_SENSOR", "RATE_HZ", "TARGETS", "TERM_TARGETS", "ActionContract",
+           "AugmentationConfig", "AverageFusion", "BirdsEyeCamera", "BirdsEyeGrid", "ConcatenationFusion", "Config",
+           "DataConfig", "EvaluationConfig", "Kinematics", "LastSeen", "LossConfig", "ModelConfig", "OptimizerConfig",
+           "PillarGrid", "PillarLidar", "PlaneCamera", "RangeViewGeometry", "RangeViewLidar", "RouteMap",
+           "TokenLatent", "TrainConfig", "TrainingMean", "TransformerFusion", "VectorLatent", "VoxelGrid",
+           "ZeroGuess", "as_kind", "check_choice", "head_targets", "override", "override_all", "parse"]

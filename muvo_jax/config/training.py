@@ -88,6 +88,8 @@ class TrainConfig:
       restart: the observed frames of a training window are cut in two at a frame drawn anew in each step, so that the
         filter is trained on 1 to observe_frames of them.
       parallel: "auto" uses shard_map over all devices where there is more than one.
+      trainable: paths of the parameters that train, as patterns separated by commas: "decoders_*" trains the decoders
+        alone, "!camera" all but the camera's encoder, "*" everything (see training/trainable.py).
       backbone_weights: file of an image network that fresh encoders start from; "" for none.
       perceptual_from: such a file, or a run whose image encoder is taken, for the perceptual term; "" for none.
     """
@@ -107,6 +109,7 @@ class TrainConfig:
     decode_frames: Annotated[int, NOT_NEGATIVE] = 0
     observe_frames: Annotated[int, NOT_NEGATIVE] = 0
     restart: bool = False
+    trainable: str = "*"
     backbone_weights: str = ""
     perceptual_from: str = ""
 

@@ -68,6 +68,16 @@ def check_architecture(wanted: config_lib.Config, stored: config_lib.Config, whe
                      f"{'; '.join(fields)}. Use the run's own settings, or a new --name.")
 
 
+def check_resumable(wanted: config_lib.Config, stored: config_lib.Config, where: str) -> None:
+    """As `check_architecture`, and ValueError where other parameters trained: the optimiser's state is of those."""
+    check_architecture(wanted, stored, where)
+    ours, theirs = wanted.train.trainable, stored.train.trainable
+    if ours != theirs:
+        raise ValueError(f"{where} was trained with train.trainable={theirs}, and cannot go on with {ours}: the "
+                         f"optimiser's state belongs to what trains. Start another run from its weights, with --init "
+                         f"and a new --name.")
+
+
 def package_versions() -> dict[str, str | None]:
     """Versions of the packages that a run depends on; None where a package is not installed as one."""
     def version(name):

@@ -21,6 +21,7 @@ from muvo_jax.training import optimizer as optimizer_lib
 from muvo_jax.training import parallel as parallel_lib
 from muvo_jax.training import state as state_lib
 from muvo_jax.training import step as step_lib
+from muvo_jax.training import trainable
 
 
 @dataclasses.dataclass(frozen=True)
@@ -44,13 +45,13 @@ class Prepared:
 
     @property
     def parameters(self) -> int:
-        """How many numbers are learned."""
+        """How many numbers the model has, frozen ones included."""
         return sum(leaf.size for leaf in jax.tree.leaves(self.state.params))
 
     def with_variables(self, variables: types.Variables, config: config_lib.Config) -> state_lib.TrainState:
         """`state` with other variables of the same shapes and a fresh optimiser."""
         optimizer = optimizer_lib.make_optimizer(config.optimizer, config.train.steps)
-        state = state_lib.create(variables, optimizer, self.state.key)
+        state = state_lib.create(variables, optimizer, self.state.key, config.train.trainable)
         return parallel_lib.place_state(self.step.plan, state)
 
 
@@ -85,6 +86,13 @@ def expected_batch(config: config_lib.Config, windows: int, *,
     return types.Batch(is_first=timed(np.bool_), **fields)
 
 
+def check_trainable(config: config_lib.Config) -> None:
+    """Raises ValueError where train.trainable does not fit the model, before anything takes long."""
+    if config.train.trainable != trainable.EVERYTHING:
+        params = world_model.WorldModel(config.model).variable_shapes()["params"]
+        trainable.chosen(params, config.train.trainable)
+
+
 def prepare(config: config_lib.Config, batch_shapes: types.Batch,
             frozen: perceptual.FrozenEncoder | None = None) -> Prepared:
     """Initialises the model and compiles its training step.
@@ -95,7 +103,7 @@ def prepare(config: config_lib.Config, batch_shapes: types.Batch,
       frozen: the network of the perceptual term, where that is on.
 
     Raises:
-      ValueError: where the batch cannot be split over the devices.
+      ValueError: where the batch cannot be split over the devices, or train.trainable does not fit the model.
     """
     start_s = time.perf_counter()
     model = world_model.WorldModel(config.model)
@@ -104,7 +112,7 @@ def prepare(config: config_lib.Config, batch_shapes: types.Batch,
     example = jax.tree.map(lambda leaf: np.zeros((1, *leaf.shape[1:]), leaf.dtype), batch_shapes)
     variables = model.init(jax.random.fold_in(run_key, 0), example)
     optimizer = optimizer_lib.make_optimizer(config.optimizer, config.train.steps)
-    state = state_lib.create(variables, optimizer, jax.random.fold_in(run_key, 1))
+    state = state_lib.create(variables, optimizer, jax.random.fold_in(run_key, 1), config.train.trainable)
     state = jax.block_until_ready(parallel_lib.place_state(step.plan, state))
     initialised_s = time.perf_counter()
     placed = jax.tree.map(lambda leaf: np.zeros(leaf.shape, leaf.dtype), batch_shapes)

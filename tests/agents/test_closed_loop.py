@@ -97,6 +97,23 @@ def test_the_planner_filters_every_step_plans_for_progress_and_compiles_once():
     assert plans.shape == (6, 4, 2) and states.features.shape[0] == 6 and memory is None
 
 
+def test_the_planner_stops_before_a_wall_unless_collisions_cost_nothing():
+    grid, bare = worlds.CONFIG.range_view, road(wall_m=16.0)
+
+    def observe(state):
+        return bare.observe(state) | {"range_view": np.full((grid.rows, grid.columns, 4), 16.0 - state[0], np.float32)}
+
+    world = dataclasses.replace(bare, observe=observe)
+    config, drives = planners.PlannerConfig(plans=48, iterations=6, std=0.7), {}
+    for collision in (5.0, 0.0):
+        environment, _ = worlds.before_a_wall(16.0, 5.0, 8, collision=collision)
+        driver = closed_loop.planning_driver(world, environment, {}, config=config, horizon=8)
+        drives[collision] = run(world, driver, steps=25)
+    assert drives[0.0].end.collided
+    assert drives[5.0].unharmed and drives[5.0].steps == 25
+    assert drives[5.0].progress_m > 7.0  # it drove on to where the wall was near
+
+
 @pytest.mark.parametrize(("options", "message"), [
     ({"planner": "a-star"}, "planner 'a-star' is unknown; known are cem, mppi, gradient"),
     ({"horizon": 0}, "horizon is 0"),

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from worlds import make
+from worlds import before_a_wall, make
 
 from muvo_jax.agents import planners
 
@@ -41,6 +41,21 @@ def test_in_imagination_the_fast_plan_is_found():
 
     plan, idle = best(jax.random.key(1))
     assert plan.value > idle and plan.actions[0, 0] > 0  # accelerating brings the car farther
+
+
+@pytest.mark.parametrize("name", planners.PLANNERS)
+def test_a_wall_ahead_is_braked_for_when_collisions_cost_and_driven_into_when_they_do_not(name):
+    """From 5 m/s, a plan that coasts for eight steps ends 8 m on; the wall is 8 m ahead, and the car reaches 3.7 m."""
+    found = {}
+    for collision in (5.0, 0.0):
+        environment, params = before_a_wall(8.0, 5.0, 8, collision=collision)
+        _, state = environment.reset(jax.random.key(0), params)
+        objective = planners.imagined_returns(environment, params, state)
+        config = planners.PlannerConfig(plans=256, iterations=20, std=0.7, temperature=0.1)
+        plan = planners.PLANNERS[name](objective, jax.random.key(1), jnp.zeros((8, 2)), config)
+        speeds_mps = 5.0 + np.cumsum(np.asarray(plan.actions[:, 0]))
+        found[collision] = 0.2 * np.maximum(speeds_mps, 0.0).sum()
+    assert found[5.0] < 8.0 - 3.7 + 1.0 and found[0.0] > 8.0
 
 
 def test_coloured_noise_has_unit_variance_and_is_smooth():

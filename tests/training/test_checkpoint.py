@@ -36,7 +36,8 @@ def fresh(config):
 def _fresh(config):
     variables = {"params": {"layer": {"kernel": jnp.arange(8.0 * 4096).reshape(8, 4096), "bias": jnp.ones(3)}},
                  "batch_stats": {"norm": {"mean": jnp.zeros(3)}}}
-    return state.create(variables, optimizer.make_optimizer(config.optimizer, 10), jax.random.key(7))
+    return state.create(variables, optimizer.make_optimizer(config.optimizer, 10), jax.random.key(7),
+                        config.train.trainable)
 
 
 def _at(fresh, step):
@@ -143,6 +144,15 @@ def test_a_checkpoint_with_the_config_of_version_1_is_read(tmp_path, fresh, conf
         _save(tmp_path, fresh, config, 1).close()
     assert checkpoint.load_run(tmp_path).config == presets.tiny()
     assert checkpoint.Checkpoints(tmp_path).restore_latest(fresh, config).step == 1
+
+
+def test_a_run_with_frozen_parameters_goes_on_and_refuses_to_train_others(tmp_path, config):
+    some = config_lib.override(config, "train.trainable", "!layer/kernel")
+    fresh = _fresh(some)
+    keeper = _save(tmp_path, fresh, some, 1)
+    _assert_same(keeper.restore_latest(fresh, some).state, _at(fresh, 1))
+    with pytest.raises(ValueError, match=r"trained with train\.trainable=!layer/kernel, .* go on with \*: .*--init"):
+        keeper.restore_latest(_fresh(config), config)
 
 
 def test_keeps_the_last_and_the_best(tmp_path, fresh, config):

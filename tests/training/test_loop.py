@@ -228,6 +228,11 @@ def test_resuming_with_another_architecture_names_both(uninterrupted):
         _train(uninterrupted[0], config=config, resume=True)
 
 
+def test_resuming_with_other_parameters_to_train_names_both_and_what_to_do(uninterrupted):
+    with pytest.raises(ValueError, match=r"trained with train\.trainable=\*, and cannot go on with !embed.*--init"):
+        _train(uninterrupted[0], config=_config(trainable="!embed"), resume=True)
+
+
 def test_a_new_run_starts_from_the_weights_of_another(tmp_path, uninterrupted):
     folder, _, final, _ = uninterrupted
     show = Interrupting()

@@ -145,7 +145,7 @@ def dream_window(model: world_model.WorldModel, variables: types.Variables, key:
         join = lambda seen, dreamt, branch=branch: jax.numpy.concatenate([seen, dreamt[:, branch]], axis=1)
         states = jax.tree.map(join, observed.states, imagined.states)
         decoded = rollout.decode(model, variables, states, heads, memory=observed.memory)
-        futures.append(jax.device_get(protocol.finish(decoded)))
+        futures.append(jax.device_get(protocol.finish(decoded, model.config)))
     return futures
 
 

@@ -218,7 +218,7 @@ def film(loaded: run_lib.Run, town: simulator.Town, drive: closed_loop.Drive,
     views = []
     for latent in (states, jax.tree.map(lambda leaf: leaf[:, -1], dreamt.states)):
         decoded = rollout.decode(model, variables, latent, heads, memory=memory)
-        frames = jax.device_get(protocol.finish(decoded))
+        frames = jax.device_get(protocol.finish(decoded, model.config))
         views.append(sheets.views_of_frames({head: value[None] for head, value in frames.items()}, 0))
     scene = sheets.Scene.of(loaded.config)
     pictures = []

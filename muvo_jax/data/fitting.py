@@ -42,7 +42,7 @@ def adapt(config: config_lib.Config, recording: schema.Recording, *, keep: Colle
     description = recording.description
     notes: list[str] = []
     contract = dataclasses.replace(description.contract, step_action=config.contract.step_action)
-    model = _fit_first_guess(_fit_model(config.model, description, notes), description, keep, notes)
+    model = _fit_first_guess(_fit_model(config.model, description, keep, notes), description, keep, notes)
     needs = prepare.needed(dataclasses.replace(config, model=model, contract=contract), description.modalities)
     data = _fit_windows(config.data, recording, keep, needs, notes)
     if description.route_map is not None:
@@ -68,7 +68,15 @@ def check_targets(config: config_lib.Config, description: schema.RecordingDescri
                                    f"hold. Leave the head out (--heads={others}), or record {field}.")
 
 
-def _fit_model(model: config_lib.ModelConfig, description: schema.RecordingDescription,
+def _columns(model: config_lib.ModelConfig, lidar: config_lib.RangeViewGeometry) -> int:
+    """The model's columns, doubled until a pixel of its memory holds one of at most eight returns."""
+    columns = model.range_view.columns
+    while model.first_guess == "last_seen" and lidar.columns > 8 * columns:
+        columns *= 2
+    return columns
+
+
+def _fit_model(model: config_lib.ModelConfig, description: schema.RecordingDescription, keep: Collection[str],
                notes: list[str]) -> config_lib.ModelConfig:
     model = _without_what_lacks(model, description, notes)
     camera, lidar, heads = description.camera, description.lidar, model.heads
@@ -79,7 +87,11 @@ def _fit_model(model: config_lib.ModelConfig, description: schema.RecordingDescr
             notes.append(f"images of {camera.width_px}x{camera.height_px} pixels become {changes['image_size'][1]}x"
                          f"{changes['image_size'][0]}: scaled by width, rows cut off at the top.")
     if lidar is not None:
-        changes["range_view"] = dataclasses.replace(lidar, rows=model.range_view.rows, columns=model.range_view.columns)
+        columns = model.range_view.columns if "model.range_view.columns" in keep else _columns(model, lidar)
+        changes["range_view"] = dataclasses.replace(lidar, rows=model.range_view.rows, columns=columns)
+        if columns != model.range_view.columns:
+            notes.append(f"range views have {columns} columns instead of {model.range_view.columns}: the lidar has "
+                         f"{lidar.columns}, and a pixel holds one return.")
     if description.voxels is not None and "occupancy" in heads:
         changes["voxels"] = description.voxels
         changes["occupancy_blocks"] = _occupancy_blocks(model.occupancy_blocks, description.voxels)

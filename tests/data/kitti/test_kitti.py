@@ -1,13 +1,12 @@
 """The KITTI raw reader on a synthetic drive; the real excerpt where it is present."""
 
 import math
-import os
-import pathlib
 import shutil
 import warnings
 
 import numpy as np
 import pytest
+import recording_samples as samples
 import recording_writers as writers
 from PIL import Image
 
@@ -231,18 +230,11 @@ def test_a_few_nan_points_are_dropped_and_counted(drive):
         assert kitti_reader.read_scan(path).shape == (199, 3)
 
 
-def real_excerpt() -> pathlib.Path | None:
-    """MUVO_KITTI, or a kitti_raw folder beside the repository."""
-    repository = pathlib.Path(__file__).parents[3]
-    candidates = [os.environ.get("MUVO_KITTI"), *repository.parent.glob("*/data/kitti_raw")]
-    return next((pathlib.Path(path) for path in candidates if path and pathlib.Path(path).is_dir()), None)
-
-
-@pytest.mark.skipif(real_excerpt() is None, reason="no real KITTI drive here; name one by MUVO_KITTI=FOLDER")
+@pytest.mark.skipif(samples.KITTI is None, reason="no real KITTI drive here; name one by MUVO_KITTI=FOLDER")
 def test_a_real_drive():
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        recording = sources.open_recording(real_excerpt())
+        recording = sources.open_recording(samples.KITTI)
     config, _ = fitting.adapt(presets.get("town"), recording)
     frame = prepare.prepare_frame(recording.read(recording.sequences[0], 0), config)
     camera_position_m = np.array(recording.description.camera.camera_to_ego)[:3, 3]

@@ -5,7 +5,7 @@ environment of its own:
 
     python experiments/nuscenes/compare.py read FOLDER               # writes the set and what our reader makes of it
     python -m venv devkit && devkit/bin/pip install nuscenes-devkit==1.2.0
-    devkit/bin/python experiments/nuscenes/compare.py judge FOLDER   # prints the table of README.md, fails where not equal
+    devkit/bin/python experiments/nuscenes/compare.py judge FOLDER   # prints the table of README.md
 """
 
 from __future__ import annotations

@@ -47,7 +47,8 @@ def write(root: pathlib.Path, names: list[str]) -> None:
     rows = ((place, name, channel, index) for place, name in enumerate(names) for channel, rate_hz in RATES_HZ.items()
             for index in range(SECONDS * rate_hz))
     with (folder / "sample_data.json").open("w") as data, (folder / "ego_pose.json").open("w") as poses:
-        for separator, (place, name, channel, index) in zip(itertools.chain("[", itertools.repeat(",")), rows, strict=False):
+        separators = itertools.chain("[", itertools.repeat(","))
+        for separator, (place, name, channel, index) in zip(separators, rows, strict=False):
             time_us = START_US + place + index * 1_000_000 // RATES_HZ[channel]
             sample, is_key = divmod(index * 2, RATES_HZ[channel])
             kind = "samples" if is_key == 0 else "sweeps"

@@ -17,11 +17,13 @@ import numpy as np
 
 from muvo_jax.data import ego_motion, fields, schema
 from muvo_jax.data.nuscenes import tables as tables_lib
+from muvo_jax.limits import between
 
 LIDAR = "LIDAR_TOP"
 SWEEP_PERIOD_S, _SPARED_S = 0.1, 0.025  # half a turn of the lidar
 _PICTURE_WITHIN_S = 0.075  # of its scan; more means that pictures were lost
 _KEY_PICTURE_WITHIN_S = 0.25
+_STEP_S = between(0.01, 2.0, "s")
 
 
 class Motion(NamedTuple):
@@ -96,6 +98,10 @@ def _scene(where: str, name: str, split: str, tables: tables_lib.Tables, scans: 
            key_frames: bool) -> Scene:
     if not (np.diff(scans["time_us"]) > 0).all():
         raise schema.DataError(f"{where}: two scans have one timestamp in sample_data.json. Unpack the metadata again.")
+    step_s = float(np.median(np.diff(scans["time_us"]))) / 1e6 if len(scans) > 1 else SWEEP_PERIOD_S
+    if not _STEP_S.holds(step_s):
+        raise schema.DataError(f"{where}: scans are {step_s:g} s apart, which must be {_STEP_S}. The timestamps of "
+                               f"sample_data.json must be microseconds.")
     if not key_frames:
         scans = scans[_spaced(scans["time_us"] / 1e6)]
     lidar, camera = (_only(rows, tables, where) for rows in (scans, pictures))
@@ -116,8 +122,9 @@ def _scene(where: str, name: str, split: str, tables: tables_lib.Tables, scans: 
     motion = Motion(*ego_motion.of_poses(pose, (scans["time_us"] - scans["time_us"][0]) / 1e6))
     for field, values in (("speed_mps", motion.speed_mps), ("yaw_rate_radps", motion.yaw_rate_radps)):
         fields.conform(field, values, f"{where}, from ego_pose.json", values.shape)
-    meanwhile = np.linalg.inv(at_scan) @ tables.poses[pictures["pose"]]
-    meanwhile[scans["pose"] == pictures["pose"]] = np.eye(4)  # exactly
+    at_picture = tables.poses[pictures["pose"]]
+    meanwhile = np.linalg.inv(at_scan) @ at_picture
+    meanwhile[(at_scan == at_picture).all(axis=(1, 2))] = np.eye(4)  # exactly
     return Scene(name, split, scans["time_us"].copy(), {
         "points_m": scans["name"].copy(), "image": np.where(is_near, pictures["name"], b"")}, {}, pose, motion,
         lidar.to_ego, described, meanwhile @ camera.to_ego)

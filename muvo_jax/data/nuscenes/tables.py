@@ -117,7 +117,9 @@ def rows(path: pathlib.Path) -> Iterator[dict[str, Any]]:
 def _objects(file: TextIO) -> Iterator[Any]:
     """What a JSON list holds, with no more of it in memory than a chunk and an item. Raises ValueError."""
     decode = json.JSONDecoder().raw_decode
-    text, at = file.read(_CHUNK_CHARS).lstrip(), 1
+    text, at = "", 1
+    while not text and (chunk := file.read(_CHUNK_CHARS)):
+        text = chunk.lstrip()
     if not text.startswith("["):
         raise ValueError("the file does not begin with [")
     while True:

@@ -14,7 +14,7 @@ from muvo_jax import config as config_lib
 from muvo_jax import presets
 from muvo_jax.agents import environment as environment_lib
 from muvo_jax.agents import planners, rewards
-from muvo_jax.model import live, memory, rollout, world_model
+from muvo_jax.model import glimpse, live, memory, rollout, world_model
 from muvo_jax.ops import camera, motion, range_view, reproject
 from muvo_jax.types import Batch, LatentState
 
@@ -85,7 +85,7 @@ def batch_of(config, batch_size=BATCH, frames=FRAMES, speed_mps=None, **fields):
 
 
 KEY = jax.random.key(5)
-look = jax.jit(memory.look, static_argnums=(0, 4))
+look = jax.jit(glimpse.look, static_argnums=(0, 4))
 
 
 def observe(model, variables, batch, **options):

@@ -24,7 +24,7 @@ import warnings
 import numpy as np
 
 from muvo_jax import config as config_lib
-from muvo_jax.data import ego_motion, files, runs, schema, words
+from muvo_jax.data import ego_motion, files, runs, schema, sequences, words
 from muvo_jax.data.nuscenes import scans, scene_splits, scenes, tables
 
 CAMERAS = ("CAM_FRONT", "CAM_FRONT_LEFT", "CAM_FRONT_RIGHT", "CAM_BACK", "CAM_BACK_LEFT", "CAM_BACK_RIGHT")
@@ -145,7 +145,7 @@ class NuScenesRecording:
         if len(found) < len(every):
             warnings.warn(f"{self._root}: {len(every) - len(found)} of {words.counted(len(every), 'scene')} have no "
                           f"{_which(key_frames)} of {camera} or {scenes.LIDAR} here (their archives were not unpacked) "
-                          f"and are left out.", files.GapWarning, stacklevel=3)
+                          f"and are left out.", sequences.GapWarning, stacklevel=3)
         return found
 
     def _cut(self, scene: scenes.Scene, modalities: frozenset[str], lacks: tuple[str, ...],
@@ -153,10 +153,10 @@ class NuScenesRecording:
         """The gap-free sequences of a scene; warns of gaps."""
         needed = [key for key in _SENSORS if key in modalities and key not in lacks]
         present = np.logical_and.reduce([np.ones(scene.frames, bool), *(scene.present[key] for key in needed)])
-        late = files.after_gap(scene.times_s, period_s)
-        pieces = files.gap_free(present, late)
+        late = sequences.after_gap(scene.times_s, period_s)
+        pieces = sequences.gap_free(present, late)
         absent = {key: int((~scene.present[key]).sum()) for key in needed}
-        files.warn_of_gaps(f"{self._root}, {scene.name}", present, absent, late, len(pieces))
+        sequences.warn_of_gaps(f"{self._root}, {scene.name}", present, absent, late, len(pieces))
         return [schema.Sequence(scene.split, scene.name, start, length, lacks) for start, length in pieces]
 
 

@@ -34,8 +34,8 @@ def of_poses(pose: np.ndarray, timestamps_s: np.ndarray) -> tuple[np.ndarray, np
     if len(pose) < 2:
         return np.zeros(len(pose)), np.zeros(len(pose)), np.zeros(len(pose))
     steps_s, yaw_rad = np.diff(timestamps_s), np.unwrap(pose[:, 2])
-    velocity_mps = np.gradient(pose[:, :2], timestamps_s, axis=0, edge_order=min(2, len(pose) - 1))
-    speed_mps = velocity_mps[:, 0] * np.cos(yaw_rad) + velocity_mps[:, 1] * np.sin(yaw_rad)
+    x_mps, y_mps = (np.gradient(pose[:, axis], timestamps_s, edge_order=2 if len(pose) > 2 else 1) for axis in (0, 1))
+    speed_mps = x_mps * np.cos(yaw_rad) + y_mps * np.sin(yaw_rad)
     to_next = lambda values: np.append(change := np.diff(values) / steps_s, change[-1])
     return speed_mps, to_next(speed_mps), to_next(yaw_rad)
 

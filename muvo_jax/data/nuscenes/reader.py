@@ -115,8 +115,10 @@ class NuScenesRecording:
     def run_files(self, name: str) -> list[pathlib.Path]:
         """See schema.ListsFiles."""
         scene = self._scenes[name]
-        return [*(self._folder / f"{table}.json" for table in tables.NAMES),
-                *(self._path(scene, key, row) for key in _SENSORS for row in np.flatnonzero(scene.present[key]))]
+        found = [self._folder / f"{table}.json" for table in tables.NAMES]
+        for key in _SENSORS:
+            found += [self._path(scene, key, row) for row in np.flatnonzero(scene.present[key]).tolist()]
+        return found
 
     def _has(self, sequence: schema.Sequence, name: str) -> bool:
         return name in self.description.modalities and sequence.has((name,))

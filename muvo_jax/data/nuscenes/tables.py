@@ -146,7 +146,8 @@ def _calibrations(folder: pathlib.Path, channels: tuple[str, ...]) -> tuple[tupl
             raise schema.DataError(f"{path}: there is no sensor {channel}; there are "
                                    f"{', '.join(sorted(set(every.values()))) or 'none'}.")
     path = folder / "calibrated_sensor.json"
-    found, places = [], {}
+    found: list[Calibration] = []
+    places: dict[str, int] = {}
     for row in rows(path):
         channel = every.get(_get(row, "sensor_token", str, path), "")
         if channel not in channels:

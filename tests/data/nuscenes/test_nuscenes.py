@@ -2,21 +2,22 @@
 
 import dataclasses
 import json
-import pathlib
 import shutil
 import warnings
 
 import numpy as np
 import nuscenes_writer as writer
 import pytest
+import recording_writers
 from PIL import Image
 
-from muvo_jax import doctor, presets
+from muvo_jax import doctor, presets, recordings, train
 from muvo_jax.data import fitting, prepare, schema, sequences, sources
 from muvo_jax.data.nuscenes import reader, scans, scene_splits, tables
 from muvo_jax.data.packed import reader as packed_reader
 from muvo_jax.data.packed import writer as packed_writer
 from muvo_jax.ops import camera as camera_ops
+from muvo_jax.training import screen
 
 
 @pytest.fixture(scope="module")
@@ -149,7 +150,6 @@ def test_every_camera_can_be_chosen(root):
 
 
 def test_only_nuscenes_has_key_frames(tmp_path):
-    import recording_writers
     plain = recording_writers.write_plain(tmp_path / "plain")
     with pytest.raises(schema.DataError, match="kind plain has no key frames; leave --key-frames out"):
         sources.open_recording(plain, key_frames=True)
@@ -402,7 +402,6 @@ def test_the_doctor_takes_missing_archives_for_no_fault(tmp_path, capsys):
     root = writer.write(tmp_path / "set", scenes=("scene-0061", "scene-0553", "scene-0103"))
     remove_files(root, "s*/*/n001__*")
     options = doctor.Options(root, out=tmp_path / "out", frames=60, workers=1)
-    from muvo_jax.training import screen
     result = doctor.examine(options, screen.Screen())
     said = [finding.text for finding in result.findings if finding.level == "problem"]
     assert said == [text for text in said if "of one colour" in text], said  # the writer's pictures are
@@ -418,7 +417,15 @@ def test_frames_are_what_a_model_eats(root):
     assert {0, 1, 255} == set(np.unique(frame["occupancy"]))
 
 
-def test_an_opened_recording_holds_no_table(root):
-    recording = reader.NuScenesRecording(root)
-    assert all(isinstance(path, pathlib.Path) and path.is_file() for path in recording.run_files("scene-0103"))
-    assert len(recording.run_files("scene-0103")) == len(tables.NAMES) + 21 + 21
+def test_a_scene_is_made_of_its_own_files_and_the_tables(root):
+    listed = reader.NuScenesRecording(root).run_files("scene-0103")
+    assert len(set(listed)) == len(tables.NAMES) + 21 + 21 and all(path.is_file() for path in listed)
+    assert all(path.parent.name == "v1.0-mini" or path.name.startswith("n001__") for path in listed)
+
+
+def test_train_takes_camera_and_key_frames(root):
+    config, *_ = train.configure(train.Options(preset="tiny", data=str(root), data_camera="CAM_BACK", key_frames=True))
+    described = recordings.open_configured(config).description
+    assert described.rate_hz == 2.0 and described.camera.camera_to_ego[0][3] == pytest.approx(0.05)  # the back one's
+    config, *_ = train.configure(train.Options(preset="tiny", data=str(root)))
+    assert recordings.open_configured(config).description.rate_hz == 10.0

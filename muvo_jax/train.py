@@ -81,7 +81,9 @@ class Options:
     data: Annotated[str | None, command_line.shown("PATH")] = None
     """"town" (built in) or the folder of a recording; its kind is recognised."""
     data_camera: Annotated[str | None, command_line.shown("NAME", "the reader's choice")] = None
-    """Which camera of the recording, where it has several (KITTI: image_00 to image_03)."""
+    """Which camera of the recording, where it has several (KITTI: image_00 to image_03; nuScenes: CAM_FRONT, ...)."""
+    key_frames: tyro.conf.FlagCreatePairsOff[bool] = False
+    """Only key frames, where the recording has them (nuScenes: 2 a second instead of 10)."""
     workers: Annotated[int | None, command_line.shown("N", "one a processor but one, 2 to 16")] = None
     """How many batches are read and decoded side by side, each by a thread."""
     name: Annotated[str | None, command_line.shown("NAME", "made of data, preset and fusion")] = None
@@ -156,6 +158,8 @@ def configure(options: Options) -> tuple[config_lib.Config, dict[str, Any], path
     heads = _heads(options, chosen.get("model.heads", base.model.heads))
     if heads is not None:
         chosen["model.heads"] = heads
+    if options.key_frames:
+        chosen["data.key_frames"] = True
     if options.augment or options.no_augment:
         if options.augment and options.no_augment:
             raise ValueError("--augment and --no-augment contradict each other: give one of them.")

@@ -38,10 +38,11 @@ RECORDED = {"errors", "fields", "words", "schema", "sequences", "files", "descri
 ALLOWED_IN_DATA = dict.fromkeys(RECORDED, RECORDED) | {
     "plain": RECORDED,
     "kitti": RECORDED,
+    "nuscenes": RECORDED,
     "muvo": RECORDED | {"plain"},  # its exporter reads the plain format
     "carla": RECORDED | {"plain", "muvo"},
     "packed": RECORDED | {"sources"},  # its writer reads any format
-    "sources": RECORDED | {"plain", "kitti", "muvo", "packed"},
+    "sources": RECORDED | {"plain", "kitti", "nuscenes", "muvo", "packed"},
     "voxelizing": RECORDED | {"plain", "muvo"},
     "prepare": RECORDED,
     "windows": RECORDED | {"prepare"},

@@ -46,7 +46,9 @@ class DataConfig:
 
     Attributes:
       path: "town" (the built-in world) or a folder of recordings.
-      camera: which one, where a recording has several (KITTI: image_00 to image_03); "" is the reader's choice.
+      camera: which one, where a recording has several (KITTI: image_00 to image_03; nuScenes: CAM_FRONT, ...); "" is
+        the reader's choice.
+      key_frames: only these, where a recording has them (nuScenes: 2 a second instead of 10).
       frames, stride: a training window is `frames` frames, each `stride` recorded frames apart.
       context, horizon: evaluation observes `context` frames and imagines `horizon` more.
       town_seed, town_size: which town, and how much of it ("default", "tiny").
@@ -58,6 +60,7 @@ class DataConfig:
 
     path: str = "town"
     camera: str = ""
+    key_frames: bool = False
     frames: Annotated[int, COUNT] = 12
     stride: Annotated[int, COUNT] = 2
     context: Annotated[int, COUNT] = 6

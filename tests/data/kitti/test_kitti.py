@@ -12,7 +12,7 @@ from PIL import Image
 
 from muvo_jax import config as config_lib
 from muvo_jax import presets
-from muvo_jax.data import fitting, prepare, schema, sources
+from muvo_jax.data import ego_motion, fitting, prepare, schema, sources
 from muvo_jax.data.kitti import reader as kitti_reader
 from muvo_jax.ops import camera as camera_ops
 
@@ -68,8 +68,8 @@ def test_actions_are_derived_from_the_motion(drive):
     np.testing.assert_array_equal(recording.action(recording.sequences[0], 0), action)
     # -1.2 m/s2 of 6 is a brake of 0.2; turning right (yaw rate -0.1 at 10 m/s) is steering to the right, > 0.
     np.testing.assert_allclose(action, [-0.2, math.atan(2.71 * 0.1 / 10) / 0.6], rtol=1e-6)
-    np.testing.assert_array_equal(kitti_reader.derive_action(0.1, 99.0, 9.0, contract), [1.0, -1.0])
-    assert kitti_reader.derive_action(5.0, 1.5, 0.0, contract)[0] == pytest.approx(0.5)
+    np.testing.assert_array_equal(ego_motion.derive_action(0.1, 99.0, 9.0, contract), [1.0, -1.0])
+    assert ego_motion.derive_action(5.0, 1.5, 0.0, contract)[0] == pytest.approx(0.5)
 
 
 def test_returns_of_the_own_car_are_left_out(drive):

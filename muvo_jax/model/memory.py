@@ -14,6 +14,7 @@ import dataclasses
 import flax.struct
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from muvo_jax.config import NO_SENSOR, ModelConfig
 from muvo_jax.geometry import VoxelGrid
@@ -223,6 +224,7 @@ def check(config: ModelConfig, states: LatentState | Array, memory: Memory | Non
             raise ValueError(f"decode: memory.{name} is {None if value is None else list(value.shape)}, expected "
                              f"{list(expected)} beside memory.pose {list(memory.pose.shape)}; this memory belongs to "
                              f"another model or is of two.")
+    check_evidence(states, memory)
     flat = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[len(lead):]), states.vantage)
     count = flat.last.shape[0]
     if rows is not None:
@@ -234,6 +236,22 @@ def check(config: ModelConfig, states: LatentState | Array, memory: Memory | Non
         raise ValueError(f"decode: got states [{', '.join(map(str, (*lead, '...')))}] and a memory of {drives} drives; "
                          f"the first axis of the states must count the drives. Pass rows= otherwise.")
     return flat, jnp.repeat(jnp.arange(drives, dtype=jnp.int32), count // drives)
+
+
+def check_evidence(states: LatentState, memory: Memory | None) -> None:
+    """Raises ValueError where concrete states are none that a memory `with_evidence` was made for; traced ones pass."""
+    vantage = states.vantage
+    if memory is None or memory.evidence is None or vantage is None or _traced(vantage):
+        return
+    newest, steps, last = memory.pose.shape[1] - 1, np.asarray(vantage.steps), np.asarray(vantage.last)
+    if (steps < 1).any() or (last != newest).any():
+        raise ValueError(f"decode: the memory's evidence holds for states imagined from its newest observation, number "
+                         f"{newest}; got states {np.unique(steps).tolist()} steps (0: not imagined) from observations "
+                         f"{np.unique(last).tolist()}. Decode these with the memory as it was before with_evidence.")
+
+
+def _traced(vantage: Vantage) -> bool:
+    return isinstance(vantage.steps, jax.core.Tracer) or isinstance(vantage.last, jax.core.Tracer)
 
 
 def look(config: ModelConfig, memory: Memory, rows: Array, vantage: Vantage,
@@ -332,10 +350,22 @@ def with_evidence(config: ModelConfig, memory: Memory | None, vantage: Vantage |
     """The memory with the evidence for voxels worked out once, for many states that are imagined from its newest
     observation: a planner's. Resampled from there it is a little blurred, and ends half a grid beyond the grid.
 
+    What is decoded with it must be imagined, at least one step, from there: see check_evidence.
+
     vantage: [B], of the states from which imagination starts; None where there is no memory.
+
+    Raises:
+      ValueError: if the vantage is not [B], or is concrete and not that of the newest observation.
     """
     if memory is None or vantage is None or "occupancy" not in config.heads:
         return memory
+    drives, frames = memory.pose.shape[:2]
+    if jnp.shape(vantage.last) != (drives,):
+        raise ValueError(f"with_evidence: got a vantage {list(jnp.shape(vantage.last))}, expected [{drives}], a "
+                         f"start in each drive of the memory.")
+    if not _traced(vantage) and ((np.asarray(vantage.last) != frames - 1) | (np.asarray(vantage.steps) != 0)).any():
+        raise ValueError("with_evidence: the vantage is not that of the memory's newest observation; take it from "
+                         "observed.last or from the latent of a stream.")
     places, rows = config.memory_frames, jnp.arange(memory.pose.shape[0])
     newest = memory.pose.shape[1] + jnp.arange(-places, 0, dtype=jnp.int32)
     index = jnp.broadcast_to(newest[None], (rows.shape[0], places))

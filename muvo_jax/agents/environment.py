@@ -19,6 +19,7 @@ import jax.numpy as jnp
 from muvo_jax import config as config_lib
 from muvo_jax import run as run_lib
 from muvo_jax.agents import forks, rewards
+from muvo_jax.agents import route as route_lib
 from muvo_jax.model import checks
 from muvo_jax.model import memory as memory_lib
 from muvo_jax.model.world_model import WorldModel
@@ -61,12 +62,14 @@ class EnvParams:
       bank: start states.
       max_steps_in_episode: int32, the horizon at which an episode is truncated.
       temperature: factor on the latent noise; 0 makes the world deterministic.
+      routes: Route [M, ...], the line on each start's route map, or None where there are no maps.
     """
 
     variables: Variables
     bank: StartBank
     max_steps_in_episode: Array
     temperature: Array
+    routes: route_lib.Route | None = None
 
 
 @flax.struct.dataclass
@@ -141,6 +144,9 @@ class Environment:
             raise ValueError(f"Environment: the driving reward needs the ego path, contract.kinematics is "
                              f"{self.contract.kinematics!r}, and this run trained no head ego_motion. Train it "
                              f"(--with-heads=ego_motion), or pass a reward_function of your own.")
+        if "occupancy" in self._reward_heads and self.reward_function is None:
+            grid, scale = self.model.config.voxels, self.reward_config.occupancy_scale
+            rewards.obstacle_layers(grid.shape[2] // scale, grid, self.reward_config.box, pooled=self.pooled)
 
     @classmethod
     def of_run(cls, run: run_lib.Run, *, learned_reward: bool = False, **options: Any) -> Environment:
@@ -162,6 +168,16 @@ class Environment:
         if self.contract.kinematics == "bicycle":
             return "bicycle"
         return "ego_motion" if "ego_motion" in self.model.config.heads else None
+
+    @property
+    def shares_future(self) -> bool:
+        """Whether a plan can be judged in the future of another one: path and reward need no latents of its own."""
+        return self.reward_function is None and self.ego_path == "bicycle"
+
+    @property
+    def pooled(self) -> bool:
+        """Whether coarse occupancy was trained on pooled labels; see rewards.centres_m."""
+        return self.model.config.numerics == "standard"
 
     @property
     def step_s(self) -> float:
@@ -232,7 +248,9 @@ class Environment:
         if not set(guessed).isdisjoint(self.decoded_heads) and (bank.memory is None or bank.row is None):
             raise ValueError(f"StartBank: it has no memory, but the heads {', '.join(guessed)} of this model look at "
                              f"what was seen of late; make it of what `observe` returned (Environment.starts).")
-        return EnvParams(jax.tree.map(jnp.asarray, variables), bank, jnp.int32(horizon), jnp.float32(temperature))
+        routes = None if bank.route_map is None else _follow(jnp.asarray(bank.route_map), self.reward_config.route)
+        return EnvParams(jax.tree.map(jnp.asarray, variables), bank, jnp.int32(horizon), jnp.float32(temperature),
+                         routes)
 
     def reset(self, key: Array, params: EnvParams) -> tuple[Any, EnvState]:
         """Draws a start from the bank: (observation, state)."""
@@ -264,7 +282,8 @@ class Environment:
         elif self.ego_path == "ego_motion":
             motion = motion_ops.moved(motion, full["ego_motion"])
         route_map = None if params.bank.route_map is None else params.bank.route_map[state.start]
-        moment = rewards.Moment(state.motion, motion, action, latent.features, for_reward, route_map)
+        moment = rewards.Moment(state.motion, motion, action, latent.features, for_reward, route_map,
+                                route_of(params, state))
         reward, terminated, terms = self._reward(moment)
         after = EnvState(latent, motion, state.start, state.time + 1, reward, terminated)
         truncated = after.time >= params.max_steps_in_episode
@@ -277,11 +296,27 @@ class Environment:
         choose = lambda new, old: jnp.where(final, new, old)
         return jax.tree.map(choose, fresh, state), jax.tree.map(choose, fresh_observation, observation)
 
+    def occupancy_ahead(self, params: EnvParams, key: Array, state: EnvState, plan: Array) -> Array:
+        """Occupancy logits [H, X, Y, Z, 2] at the reward's scale after each step of a plan [H, 2], in the frame of the
+        car of that moment. The noise is that of `play` under the same key."""
+        keys = jax.vmap(lambda key: jax.random.split(key)[1])(jax.random.split(key, plan.shape[0]))
+
+        def step(latent, inputs):
+            key, action = inputs
+            noise = params.temperature * jax.random.normal(key, latent.stochastic.shape, jnp.float32)
+            batched = jax.tree.map(lambda leaf: jnp.expand_dims(leaf, 0), (noise, latent, self._checked(action)))
+            latent = self.model.imagine_step(params.variables, *batched)[0][0]
+            return latent, latent
+
+        _, latents = jax.lax.scan(step, state.latent, (keys, plan))
+        return self._decode(params.variables, params.bank, latents, jnp.broadcast_to(state.start, plan.shape[:1]),
+                            ("occupancy",))[1]["occupancy"]
+
     def _reward(self, moment: rewards.Moment) -> tuple[Array, Array, dict[str, Array]]:
         if self.reward_function is not None:
             return self.reward_function(moment)
         return rewards.driving_reward(moment, grid=self.model.config.voxels, contract=self.contract, step_s=self.step_s,
-                                      config=self.reward_config)
+                                      config=self.reward_config, pooled=self.pooled)
 
     def _decode(self, variables: Variables, bank: StartBank, latent: LatentState, start: Array,
                 heads: tuple[str, ...] | None = None):
@@ -302,6 +337,16 @@ class Environment:
 
     def _checked(self, action: Array) -> Array:
         return jnp.clip(checks.one_action(action, (), "Environment.step"), -1.0, 1.0)
+
+
+@functools.partial(jax.jit, static_argnames=("scale",))
+def _follow(route_maps, scale):
+    return jax.vmap(lambda route_map: route_lib.follow(route_map, scale))(route_maps)
+
+
+def route_of(params: EnvParams, state: EnvState) -> route_lib.Route | None:
+    """The route of a state's start, or None."""
+    return None if params.routes is None else jax.tree.map(lambda leaf: leaf[state.start], params.routes)
 
 
 def play(environment: Environment, params: EnvParams, key: Array, state: EnvState, driver: Any,

@@ -16,8 +16,10 @@ import jax.numpy as jnp
 import optax
 
 from muvo_jax.agents import environment as environment_lib
+from muvo_jax.agents import rewards
 from muvo_jax.limits import COUNT, NOT_NEGATIVE, SHARE, above, check
 from muvo_jax.model import checks
+from muvo_jax.ops import motion as motion_ops
 from muvo_jax.ops import precision
 from muvo_jax.types import Array
 
@@ -157,14 +159,59 @@ def imagined_returns(environment: environment_lib.Environment, params: environme
 
         def one(key, plan):
             _, transitions = environment_lib.play(environment, params, key, state, plan, horizon)
-            alive = 1.0 - transitions.terminated.astype(jnp.float32)
-            before = jnp.concatenate([jnp.ones(1, jnp.float32), jnp.cumprod(alive)[:-1]])
-            return (discount ** jnp.arange(horizon, dtype=jnp.float32) * before * transitions.reward).sum()
+            return _discounted(transitions.reward, transitions.terminated, discount)
 
         keys = jax.random.split(key, noises)
         return jax.vmap(lambda plan: jax.vmap(one, (0, None))(keys, plan).mean())(plans)
 
     return returns
+
+
+def shared_future_returns(environment: environment_lib.Environment, params: environment_lib.EnvParams,
+                          state: environment_lib.EnvState, *, discount: float = 0.98) -> Objective:
+    """As imagined_returns, but one future is imagined for all plans: that of the first (CEM's and MPPI's mean).
+
+    Every plan drives through the occupancy that was predicted along it, on the path of the contract's bicycle: the
+    others on the road are taken to do the same whatever the car does. Of P plans one is imagined and decoded instead of
+    all; for that one the returns are those of imagined_returns.
+
+    Raises:
+      ValueError: for a reward or a path that need each plan's own latents (Environment.shares_future).
+    """
+    if not environment.shares_future:
+        raise ValueError(f"shared_future_returns: the reward is a function of its own or the path is that of "
+                         f"{environment.ego_path!r}, which need each plan's own future; use imagined_returns.")
+    config, box = environment.reward_config, environment.reward_config.box
+    grid, pooled = environment.model.config.voxels, environment.pooled
+
+    def returns(key, plans):
+        count, horizon = plans.shape[:2]
+        motion = motion_ops.path(jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (count, *leaf.shape)), state.motion),
+                                 plans, environment.contract, environment.periods)
+        before = jax.tree.map(lambda start, path: jnp.concatenate(
+            [jnp.broadcast_to(start, (count, 1, *start.shape)), path[:, :-1]], axis=1), state.motion, motion)
+        touched = None
+        if config.collision:
+            occupancy = environment.occupancy_ahead(params, jax.random.split(key, 1)[0], state, jax.lax.stop_gradient(plans[0]))
+            obstacles = rewards.obstacle_plan(occupancy, grid, box, pooled=pooled)
+            pose = motion_ops.relative(motion.pose, jax.lax.stop_gradient(motion.pose[:1]))
+            poses = jnp.swapaxes(rewards.poses_ahead(pose, before, motion, config.ahead_s), 0, 1)  # [H, P, 3, 3]
+            touched = rewards.box_collision(obstacles, poses.reshape(horizon, -1, 3), grid, box, pooled=pooled)
+            touched = touched.reshape(horizon, count, -1).max(axis=-1).T
+        moment = rewards.Moment(before, motion, plans, state.latent.features, {},
+                                route=environment_lib.route_of(params, state))
+        reward, terminated, _ = rewards.weighed(moment, touched, contract=environment.contract,
+                                                step_s=environment.step_s, config=config)
+        return jax.vmap(lambda reward, ended: _discounted(reward, ended, discount))(reward, terminated)
+
+    return returns
+
+
+def _discounted(reward: Array, terminated: Array, discount: float) -> Array:
+    """The return of rewards [H]; after the step that terminates nothing more is earned."""
+    alive = 1.0 - terminated.astype(jnp.float32)
+    before = jnp.concatenate([jnp.ones(1, jnp.float32), jnp.cumprod(alive)[:-1]])
+    return (discount ** jnp.arange(reward.shape[0], dtype=jnp.float32) * before * reward).sum()
 
 
 def shift(plan: Array) -> Array:

@@ -349,7 +349,7 @@ def test_an_environment_sees_the_memory_of_its_start():
     model = model_of()
     batch = batch_of(model.config)
     observed = observe(model, trained(model), batch)
-    environment, params = environment_of(model, observed, batch, reward_config=rewards.RewardConfig(occupancy_scale=4))
+    environment, params = environment_of(model, observed, batch, reward_config=rewards.RewardConfig(occupancy_scale=2))
     assert params.bank.size == BATCH * (FRAMES - 1) and params.bank.row.tolist() == [0, 0, 0, 1, 1, 1]
     assert params.bank.memory is observed.memory
     params = dataclasses.replace(params, temperature=jnp.float32(0.0))

@@ -66,7 +66,7 @@ class RewardConfig:
     collision: Annotated[float, NOT_NEGATIVE] = 5.0
     comfort: Annotated[float, NOT_NEGATIVE] = 0.05
     speeding: Annotated[float, NOT_NEGATIVE] = 1.0
-    tolerated_collision: Annotated[float, between(0, 0.99)] = 0.5
+    tolerated_collision: Annotated[float, between(0, 0.99)] = 0.3
     terminal_collision: Annotated[float, NOT_NEGATIVE] = 0.7
     ahead_s: Annotated[float, NOT_NEGATIVE] = 0.4
     route_tolerance_m: Annotated[float, above(0, unit="m")] = 2.0
@@ -156,15 +156,18 @@ def box_collision(plan: Array, poses: Array, grid: config_lib.VoxelGrid, box: Eg
       plan: [..., X, Y] from obstacle_plan, in some ego frame.
       poses: [..., N, 3], x, y, yaw of the car in that frame; zeros for the occupancy decoded at the very step.
       grid: the full-size grid.
-      box: the body, sampled bilinearly at most half a voxel apart; outside the grid nothing is occupied.
+      box: the body, sampled bilinearly at most half a voxel apart, to a quarter of a voxel within its sides: an
+        occupied voxel that begins where the car ends gives 1/4. Outside the grid nothing is occupied.
       pooled: see `centres_m`.
 
     Returns:
       float32 [..., N].
     """
     (rows_m, size_m), (columns_m, _) = (centres_m(plan.shape[axis - 2], axis, grid, pooled=pooled) for axis in (0, 1))
-    along = np.linspace(box.rear_m, box.front_m, math.ceil((box.front_m - box.rear_m) / (0.5 * size_m)) + 1)
-    across = np.linspace(-box.half_width_m, box.half_width_m, math.ceil(4 * box.half_width_m / size_m) + 1)
+    spread = lambda low_m, high_m: np.linspace(low_m, high_m, math.ceil(2 * max(high_m - low_m, 0) / size_m) + 1)
+    margin_m = min(0.25 * size_m, 0.5 * box.half_width_m)
+    along = spread(box.rear_m + margin_m, box.front_m - margin_m)
+    across = spread(margin_m - box.half_width_m, box.half_width_m - margin_m)
     x, y = (jnp.asarray(axis.ravel(), jnp.float32) for axis in np.meshgrid(along, across, indexing="ij"))
     poses = jnp.expand_dims(poses, -2)  # [..., N, 1, 3] beside the points [P]
     cosine, sine = jnp.cos(poses[..., 2]), jnp.sin(poses[..., 2])

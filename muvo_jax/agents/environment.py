@@ -63,6 +63,7 @@ class EnvParams:
       max_steps_in_episode: int32, the horizon at which an episode is truncated.
       temperature: factor on the latent noise; 0 makes the world deterministic.
       routes: Route [M, ...], the line on each start's route map, or None where there are no maps.
+      seen: float32 [M, X, Y], obstacles that each start's own scan showed (rewards.seen_plan), or None without memory.
     """
 
     variables: Variables
@@ -70,6 +71,7 @@ class EnvParams:
     max_steps_in_episode: Array
     temperature: Array
     routes: route_lib.Route | None = None
+    seen: Array | None = None
 
 
 @flax.struct.dataclass
@@ -144,7 +146,7 @@ class Environment:
             raise ValueError(f"Environment: the driving reward needs the ego path, contract.kinematics is "
                              f"{self.contract.kinematics!r}, and this run trained no head ego_motion. Train it "
                              f"(--with-heads=ego_motion), or pass a reward_function of your own.")
-        if "occupancy" in self._reward_heads and self.reward_function is None:
+        if self._tests_collisions:
             grid, scale = self.model.config.voxels, self.reward_config.occupancy_scale
             rewards.obstacle_layers(grid.shape[2] // scale, grid, self.reward_config.box, pooled=self.pooled)
 
@@ -192,10 +194,14 @@ class Environment:
         return tuple(dict.fromkeys((*wanted, *self._reward_heads, *path)))
 
     @property
+    def _tests_collisions(self) -> bool:
+        return self.reward_function is None and self.reward_config.collision > 0
+
+    @property
     def _reward_heads(self) -> tuple[str, ...]:
         if self.reward_heads is not None:
             return self.reward_heads
-        return ("occupancy",) if self.reward_function is None and self.reward_config.collision else ()
+        return ("occupancy",) if self._tests_collisions else ()
 
     @property
     def observation_shapes(self) -> Any:
@@ -249,8 +255,12 @@ class Environment:
             raise ValueError(f"StartBank: it has no memory, but the heads {', '.join(guessed)} of this model look at "
                              f"what was seen of late; make it of what `observe` returned (Environment.starts).")
         routes = None if bank.route_map is None else _follow(jnp.asarray(bank.route_map), self.reward_config.route)
+        seen = None
+        if self._tests_collisions and bank.memory is not None and bank.row is not None:
+            seen = _seen(bank.memory.range_view, bank.row, bank.latent.vantage.last, self.model.config.voxels,
+                         self.reward_config.box)
         return EnvParams(jax.tree.map(jnp.asarray, variables), bank, jnp.int32(horizon), jnp.float32(temperature),
-                         routes)
+                         routes, seen)
 
     def reset(self, key: Array, params: EnvParams) -> tuple[Any, EnvState]:
         """Draws a start from the bank: (observation, state)."""
@@ -283,7 +293,7 @@ class Environment:
             motion = motion_ops.moved(motion, full["ego_motion"])
         route_map = None if params.bank.route_map is None else params.bank.route_map[state.start]
         moment = rewards.Moment(state.motion, motion, action, latent.features, for_reward, route_map,
-                                route_of(params, state))
+                                route_of(params, state), self.seen_ahead(params, state, after_steps=state.time + 1))
         reward, terminated, terms = self._reward(moment)
         after = EnvState(latent, motion, state.start, state.time + 1, reward, terminated)
         truncated = after.time >= params.max_steps_in_episode
@@ -311,6 +321,14 @@ class Environment:
         _, latents = jax.lax.scan(step, state.latent, (keys, plan))
         return self._decode(params.variables, params.bank, latents, jnp.broadcast_to(state.start, plan.shape[:1]),
                             ("occupancy",))[1]["occupancy"]
+
+    def seen_ahead(self, params: EnvParams, state: EnvState, after_steps: Array) -> Array | None:
+        """What was seen at the start and counts `after_steps` [*L] steps later: [*L, X, Y]; None without memory."""
+        if params.seen is None:
+            return None
+        holds = after_steps * self.step_s <= self.reward_config.seen_s + 1e-6
+        return jnp.where(jnp.expand_dims(holds, (-2, -1)), jnp.broadcast_to(
+            params.seen[state.start], (*jnp.shape(after_steps), *params.seen.shape[1:])), 0.0)
 
     def _reward(self, moment: rewards.Moment) -> tuple[Array, Array, dict[str, Array]]:
         if self.reward_function is not None:
@@ -342,6 +360,11 @@ class Environment:
 @functools.partial(jax.jit, static_argnames=("scale",))
 def _follow(route_maps, scale):
     return jax.vmap(lambda route_map: route_lib.follow(route_map, scale))(route_maps)
+
+
+@functools.partial(jax.jit, static_argnames=("grid", "box"))
+def _seen(scans, row, last, grid, box):
+    return jax.lax.map(lambda which: rewards.seen_plan(scans[which[0], which[1]], grid, box), (row, last))
 
 
 def route_of(params: EnvParams, state: EnvState) -> route_lib.Route | None:

@@ -181,30 +181,41 @@ def shared_future_returns(environment: environment_lib.Environment, params: envi
     if not environment.shares_future:
         raise ValueError(f"shared_future_returns: the reward is a function of its own or the path is that of "
                          f"{environment.ego_path!r}, which need each plan's own future; use imagined_returns.")
-    config, box = environment.reward_config, environment.reward_config.box
-    grid, pooled = environment.model.config.voxels, environment.pooled
 
     def returns(key, plans):
-        count, horizon = plans.shape[:2]
-        motion = motion_ops.path(jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (count, *leaf.shape)), state.motion),
-                                 plans, environment.contract, environment.periods)
-        before = jax.tree.map(lambda start, path: jnp.concatenate(
-            [jnp.broadcast_to(start, (count, 1, *start.shape)), path[:, :-1]], axis=1), state.motion, motion)
+        count = plans.shape[0]
+        start = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (count, 1, *leaf.shape)), state.motion)
+        after = motion_ops.path(jax.tree.map(lambda leaf: leaf[:, 0], start), plans, environment.contract,
+                                environment.periods)
+        before = jax.tree.map(lambda first, path: jnp.concatenate([first, path[:, :-1]], axis=1), start, after)
         touched = None
-        if config.collision:
-            occupancy = environment.occupancy_ahead(params, jax.random.split(key, 1)[0], state, jax.lax.stop_gradient(plans[0]))
-            obstacles = rewards.obstacle_plan(occupancy, grid, box, pooled=pooled)
-            pose = motion_ops.relative(motion.pose, jax.lax.stop_gradient(motion.pose[:1]))
-            poses = jnp.swapaxes(rewards.poses_ahead(pose, before, motion, config.ahead_s), 0, 1)  # [H, P, 3, 3]
-            touched = rewards.box_collision(obstacles, poses.reshape(horizon, -1, 3), grid, box, pooled=pooled)
-            touched = touched.reshape(horizon, count, -1).max(axis=-1).T
-        moment = rewards.Moment(before, motion, plans, state.latent.features, {},
+        if environment.reward_config.collision:
+            touched = _touched(environment, params, jax.random.split(key, 1)[0], state, plans[0], before, after)
+        moment = rewards.Moment(before, after, plans, state.latent.features, {},
                                 route=environment_lib.route_of(params, state))
         reward, terminated, _ = rewards.weighed(moment, touched, contract=environment.contract,
-                                                step_s=environment.step_s, config=config)
+                                                step_s=environment.step_s, config=environment.reward_config)
         return jax.vmap(lambda reward, ended: _discounted(reward, ended, discount))(reward, terminated)
 
     return returns
+
+
+def _touched(environment, params, key, state, shared, before, after):
+    """Collision probabilities [P, H] of the motions [P, H] in what is imagined under the plan `shared`, the first."""
+    config, grid, pooled = environment.reward_config, environment.model.config.voxels, environment.pooled
+    count, horizon = after.speed_mps.shape
+
+    def under(obstacles, pose, pooled=True):
+        poses = jnp.swapaxes(rewards.poses_ahead(pose, before, after, config.ahead_s), 0, 1)  # [H, P, N, 3]
+        found = rewards.box_collision(obstacles, poses.reshape(horizon, -1, 3), grid, config.box, pooled=pooled)
+        return found.reshape(horizon, count, -1).max(axis=-1).T
+
+    # The others' gradients see the future as it is: it moves with the shared plan, not with theirs.
+    occupancy = environment.occupancy_ahead(params, key, state, jax.lax.stop_gradient(shared))
+    imagined = rewards.obstacle_plan(occupancy, grid, config.box, pooled=pooled)
+    touched = under(imagined, motion_ops.relative(after.pose, jax.lax.stop_gradient(after.pose[:1])), pooled)
+    seen = environment.seen_ahead(params, state, state.time + 1 + jnp.arange(horizon))
+    return touched if seen is None else jnp.maximum(touched, under(seen, after.pose))
 
 
 def _discounted(reward: Array, terminated: Array, discount: float) -> Array:

@@ -22,6 +22,7 @@ from muvo_jax.agents import route as route_lib
 from muvo_jax.config import RouteMap
 from muvo_jax.limits import COUNT, NOT_NEGATIVE, above, between
 from muvo_jax.ops import motion as motion_ops
+from muvo_jax.ops import reproject
 from muvo_jax.types import Array, Motion
 
 ROAD_M = 0.0  # its height in the ego frame; the voxels that hold it are occupied
@@ -54,6 +55,7 @@ class RewardConfig:
         progress, a metre per second too fast costs what one too slow costs.
       terminal_collision: an imagined drive ends where the collision probability exceeds this; at 1 it never ends.
       ahead_s: the collision is sought where the car is and where it will be within this time; see `collision`.
+      seen_s: what was seen at the start is an obstacle for this long, wherever imagination has it go.
       route_tolerance_m: sigma of the decay with distance from the route.
       speed_limit_mps: what counts as fast.
       comfortable_mps2: acceleration, along and across, that costs 1.
@@ -69,7 +71,8 @@ class RewardConfig:
     tolerated_collision: Annotated[float, between(0, 0.99)] = 0.3
     terminal_collision: Annotated[float, NOT_NEGATIVE] = 0.7
     ahead_s: Annotated[float, NOT_NEGATIVE] = 0.4
-    route_tolerance_m: Annotated[float, above(0, unit="m")] = 2.0
+    seen_s: Annotated[float, NOT_NEGATIVE] = 1.0
+    route_tolerance_m: Annotated[float, above(0, unit="m")] = 1.0
     speed_limit_mps: Annotated[float, above(0, unit="m/s")] = 10.0
     comfortable_mps2: Annotated[float, above(0, unit="m/s2")] = 3.0
     occupancy_scale: Annotated[int, COUNT] = 1
@@ -91,6 +94,8 @@ class Moment:
       decoded: head -> full-size prediction after the step, for the heads that were asked for.
       route_map: uint8 or float32 [..., 64, 64], the last observed one, or None.
       route: the line that it shows, in the same frame as the motions, or None.
+      seen: float32 [..., X, Y], 1 where something stood at the height of the car when the start was observed (see
+        `seen_plan`), in the same frame; None where that is unknown.
     """
 
     before: Motion
@@ -100,6 +105,7 @@ class Moment:
     decoded: Mapping[str, Array]
     route_map: Array | None = None
     route: route_lib.Route | None = None
+    seen: Array | None = None
 
 
 def obstacle_plan(occupancy: Array, grid: config_lib.VoxelGrid, box: EgoBox, *, pooled: bool = True) -> Array:
@@ -143,10 +149,20 @@ def obstacle_layers(layers: int, grid: config_lib.VoxelGrid, box: EgoBox, *, poo
     thick_m = spacing_m if pooled else grid.voxel_size_m
     low_m, high_m = heights_m[chosen[0]] - 0.5 * thick_m, heights_m[chosen[-1]] + 0.5 * thick_m
     if low_m <= ROAD_M < high_m:
-        raise ValueError(f"occupancy in {layers} layers: the one that tells of a car at {box.low_m:g} to {box.high_m:g} "
-                         f"m reaches from {low_m:g} to {high_m:g} m and holds the road, so everything would be an "
-                         f"obstacle. Read a finer scale (occupancy_scale), or lift the box.")
+        raise ValueError(f"occupancy in {layers} layers: the one for the heights of a car, {box.low_m:g} to "
+                         f"{box.high_m:g} m, reaches from {low_m:g} to {high_m:g} m and holds the road, so everything "
+                         f"would be an obstacle. Read a finer scale (occupancy_scale), or lift the box.")
     return chosen
+
+
+def seen_plan(range_view: Array, grid: config_lib.VoxelGrid, box: EgoBox) -> Array:
+    """Where a scan [Hr, Wr, 4] hit something at the height of the car, but not under it: float32 [X, Y], 1 or 0."""
+    points = range_view.reshape(1, -1, 4)
+    hits = reproject.hit_voxels(points[..., :3], points[..., 3] > 0.0, grid)[0]
+    layers = obstacle_layers(grid.shape[2], grid, box)
+    (x, _), (y, _) = (centres_m(grid.shape[axis], axis, grid, pooled=True) for axis in (0, 1))
+    own = ((x > box.rear_m) & (x < box.front_m))[:, None] & (np.abs(y) < box.half_width_m)[None]
+    return jnp.where(own, 0.0, (hits[..., layers[0]:layers[-1] + 1] > 0.0).any(axis=-1).astype(jnp.float32))
 
 
 def box_collision(plan: Array, poses: Array, grid: config_lib.VoxelGrid, box: EgoBox, *, pooled: bool = True) -> Array:
@@ -180,13 +196,13 @@ def box_collision(plan: Array, poses: Array, grid: config_lib.VoxelGrid, box: Eg
 
 
 def poses_ahead(pose: Array, before: Motion, after: Motion, ahead_s: float) -> Array:
-    """Where a car at pose [..., 3] is now and within `ahead_s` if it keeps speed and bend: [..., 3, 3].
+    """Where a car at pose [..., 3] is now and within `ahead_s` if it keeps speed and bend: [..., 5, 3].
 
     before, after: Motion [...] at the two ends of its last step; they give speed and bend.
     """
     step = after.pose - before.pose
     driven = jnp.sqrt((step[..., :2] ** 2).sum(axis=-1) + 1e-6)
-    reach_m = jnp.stack([share * ahead_s * after.speed_mps for share in (0.0, 0.5, 1.0)], axis=-1)
+    reach_m = jnp.stack([share * ahead_s * after.speed_mps for share in (0.0, 0.25, 0.5, 0.75, 1.0)], axis=-1)
     turn = reach_m * jnp.expand_dims(step[..., 2] / driven, -1)
     heading = jnp.expand_dims(pose[..., 2], -1) + 0.5 * turn
     way = jnp.stack([reach_m * jnp.cos(heading), reach_m * jnp.sin(heading), turn], axis=-1)
@@ -215,9 +231,9 @@ def bilinear(plane: Array, rows: Array, columns: Array) -> Array:
 def progress_m(moment: Moment, config: RewardConfig) -> Array:
     """Metres gained along the route in the direction in which the car stood on it at the start.
 
-    What is gained counts exp(-d^2 / 2 sigma^2) at the distance d from the route, and never more than was driven; what is
-    lost counts in full, wherever it was. So no drive, however it circles, leaves and rejoins, sums up to more than its
-    end lies farther along than its start. Without a route map: metres along the heading of the start.
+    What is gained counts exp(-d^2 / 2 sigma^2) at the distance d from the route, and never more than was driven; what
+    is lost counts in full, wherever it was. So no drive, however it circles, leaves and rejoins, sums up to more than
+    its end lies farther along than its start. Without a route map: metres along the heading of the start.
     """
     before, after = moment.before.pose, moment.after.pose
     if moment.route is None:
@@ -250,14 +266,19 @@ def speeding(moment: Moment, config: RewardConfig) -> Array:
 
 
 def collision(moment: Moment, grid: config_lib.VoxelGrid, config: RewardConfig, *, pooled: bool = True) -> Array:
-    """Collision probability [...] in the occupancy decoded after the step, in whose frame the car stands at the origin.
+    """Collision probability [...] after a step: the largest one where the car is and where it will be within `ahead_s`,
+    in the occupancy decoded after the step (there the car stands at the origin) and in what was seen at the start.
 
-    The largest one where the car is and where it will be within `ahead_s`. No car of a recording ever saw an obstacle
-    in its own place, so a model learns that the place under the car is empty, and clears away what the car hits.
+    Imagination alone is not to be trusted here: no car of a recording ever saw an obstacle in its own place or close
+    before it at speed, so a model learns that these places are empty and clears away what the car is about to hit.
     """
     plan = obstacle_plan(moment.decoded["occupancy"], grid, config.box, pooled=pooled)
     poses = poses_ahead(jnp.zeros_like(moment.after.pose), moment.before, moment.after, config.ahead_s)
-    return box_collision(plan, poses, grid, config.box, pooled=pooled).max(axis=-1)
+    imagined = box_collision(plan, poses, grid, config.box, pooled=pooled).max(axis=-1)
+    if moment.seen is None:
+        return imagined
+    poses = poses_ahead(moment.after.pose, moment.before, moment.after, config.ahead_s)
+    return jnp.maximum(imagined, box_collision(moment.seen, poses, grid, config.box).max(axis=-1))
 
 
 def driving_reward(moment: Moment, *, grid: config_lib.VoxelGrid, contract: config_lib.ActionContract, step_s: float,

@@ -83,7 +83,7 @@ def test_the_plan_whose_future_is_shared_is_worth_what_it_is_in_its_own():
     np.testing.assert_allclose(shared[0], own[0], rtol=1e-4)
     assert np.abs(shared[1:] - own[1:]).max() > 1e-4  # the others see its future, not theirs
     learned, _ = make(reward_function=lambda moment: (moment.features.sum(), jnp.bool_(False), {}))
-    with pytest.raises(ValueError, match="the reward is a function of its own.*use imagined_returns"):
+    with pytest.raises(ValueError, match=r"the reward is a function of its own.*use imagined_returns"):
         planners.shared_future_returns(learned, params, state)
 
 

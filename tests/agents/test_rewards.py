@@ -1,6 +1,7 @@
 """Ego path and rewards: worked arithmetic."""
 
 import dataclasses
+import itertools
 
 import jax
 import jax.numpy as jnp
@@ -46,7 +47,7 @@ def driven(poses, speed=10.0, line=STRAIGHT, config=CONFIG, **fields):
 def through(*corners, step_m=2.0):
     """Poses every step_m along straight stretches between corners [x, y]."""
     stretches = []
-    for start, end in zip(corners, corners[1:], strict=False):
+    for start, end in itertools.pairwise(corners):
         start, end = np.array(start, float), np.array(end, float)
         yaw, count = np.arctan2(*(end - start)[::-1]), round(np.linalg.norm(end - start) / step_m)
         stretches += [[*(start + (end - start) * k / count), yaw] for k in range(count)]
@@ -154,7 +155,7 @@ def test_the_line_of_a_map_is_the_towns_route():
     line_m = np.concatenate([np.stack([np.arange(-12, 10, 0.5), np.zeros(44)], 1), turn, turn[-1] - [[0, 8], [0, 16]]])
     line = map_of(line_m)
     points, along = np.asarray(line.points_m)[line.known], np.asarray(line.along_m)[line.known]
-    dense = np.concatenate([np.linspace(a, b, 20) for a, b in zip(line_m, line_m[1:], strict=False)])
+    dense = np.concatenate([np.linspace(a, b, 20) for a, b in itertools.pairwise(line_m)])
     assert np.linalg.norm(points[:, None] - dense[None], axis=-1).min(axis=1).max() < 1.3
     assert along[0] < -8 and along[-1] > 10 + 12 * np.pi / 2 + 8 and (np.diff(along) > 0).all()
     at, away = route.place(line, jnp.array([[5.0, 0.0, 0.0], [-5.0, 1.0, 0.0], [22.0, -20.0, -1.6]]))

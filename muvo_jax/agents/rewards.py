@@ -50,7 +50,8 @@ class RewardConfig:
       progress: per metre along the route, divided by the metres of a step at `speed_limit_mps`; what is more than those
         earns nothing.
       collision: times the collision probability above `tolerated_collision`, which is about what a car parked beside
-        the lane gives, and all that an untrained model says.
+        the lane gives. It must cost more than all that a plan or an episode can earn until then: a drive that ends has
+        no more to lose, and where collisions are cheap it is worth as much as braking in time.
       comfort, speeding: times the respective penalty. The limit is the best speed whatever `speeding` is; equal to
         progress, a metre per second too fast costs what one too slow costs.
       terminal_collision: an imagined drive ends where the collision probability exceeds this; at 1 it never ends.
@@ -65,7 +66,7 @@ class RewardConfig:
     """
 
     progress: Annotated[float, NOT_NEGATIVE] = 1.0
-    collision: Annotated[float, NOT_NEGATIVE] = 5.0
+    collision: Annotated[float, NOT_NEGATIVE] = 20.0
     comfort: Annotated[float, NOT_NEGATIVE] = 0.05
     speeding: Annotated[float, NOT_NEGATIVE] = 1.0
     tolerated_collision: Annotated[float, between(0, 0.99)] = 0.3

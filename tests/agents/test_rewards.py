@@ -236,10 +236,10 @@ def test_the_reward_adds_up_and_ends_at_a_collision():
     np.testing.assert_allclose(reward, 0.5, rtol=1e-4)  # 1 m of the 2 m that the limit allows
     assert not terminated
     reward, terminated, terms = whole(logits([(10, 8, 2), (10, 7, 2), (11, 8, 2), (11, 7, 2)]))
-    np.testing.assert_allclose(reward, 0.5 - 5.0 * (terms["collision"] - 0.3) / 0.7, rtol=1e-4)
+    np.testing.assert_allclose(reward, 0.5 - 20.0 * (terms["collision"] - 0.3) / 0.7, rtol=1e-4)
     assert terminated
     reward, terminated, _ = whole(jnp.zeros((*GRID.shape, 2)))  # as likely as not, everywhere: an untrained model
-    np.testing.assert_allclose(reward, 0.5 - 5.0 * 0.2 / 0.7, rtol=1e-4)
+    np.testing.assert_allclose(reward, 0.5 - 20.0 * 0.2 / 0.7, rtol=1e-4)
     assert not terminated
 
 

@@ -31,6 +31,7 @@ LIDAR_ENCODERS = ("rv", "pp")
 CAMERA_ENCODERS = ("wob", "bev")
 NO_SENSOR = "none"  # in place of an encoder
 LATENTS = ("1d", "2d")
+FLOW_LAGS = 3  # older observations that tell what moves by itself
 BACKBONES = ("resnet18", "mobilevitv2_100")
 RATE_HZ = above(0, 10_000, "Hz")
 STEERING_RAD = Limits(0, 0.5 * math.pi, open_low=True, open_high=True, unit="rad")
@@ -116,11 +117,15 @@ class ModelConfig:
         "last_seen": from what the sensors showed of late, moved by the motion of the car, and from the average where
         that covers nothing; see model/memory.py.
       memory_frames: so many observations are remembered for that.
+      follow_movers: what was seen to move by itself goes on moving in the memory of the voxels (ops/scene_flow.py);
+        otherwise it stays where it was last seen.
       guided_channels: widths of the decoders of image, range view and occupancy that see the memory.
       action_path: "prior": actions reach the prior and the posterior only, as in the paper. "recurrence": they and the
         step that they cause enter the recurrence too, and the start of every token.
       kinematics: what actions do, where they describe the motion; Config fills it in from contract and stride.
       range_view_points: "beams": x, y, z are drawn as the difference from the point along the pixel's beam.
+      occupied_above: a voxel is called occupied where its probability is above this. Most voxels are empty, and the
+        decision that overlaps best is below one half: at the intersection over union J that it reaches, J / (1 + J).
       compute_dtype: of the matrix work; parameters, norms, softmax and losses stay float32.
       convolution: "auto" takes the forms of ops/conv.py that are fast on this backend, "xla" the plain ones (needed for
         forward-mode differentiation), "gemm" the CPU forms.
@@ -168,10 +173,12 @@ class ModelConfig:
     occupancy_token_stages: Annotated[int, NOT_NEGATIVE] = 1
     first_guess: Literal["zero", "training_mean", "last_seen"] = "zero"
     memory_frames: Annotated[int, COUNT] = 6
+    follow_movers: bool = False
     guided_channels: Annotated[tuple[int, int, int], COUNT] = (64, 64, 64)
     action_path: Literal["prior", "recurrence"] = "prior"
     kinematics: Kinematics | None = None
     range_view_points: Literal["free", "beams"] = "free"
+    occupied_above: Annotated[float, Limits(0, 1, open_low=True, open_high=True)] = 0.5
     compute_dtype: Literal["float32", "bfloat16"] = "float32"
     convolution: Literal["auto", "xla", "gemm"] = "auto"
     range_scale_m: Annotated[float, above(0, unit="m")] = 50.0
@@ -213,8 +220,9 @@ class ModelConfig:
         if gridded and any(side % shrink for side in self.voxels.shape):
             raise ValueError(f"model.voxels.shape {self.voxels.shape}: each side must be a multiple of {shrink} "
                              f"(2**({field} + 3)).")
-        if self.memory_frames < 1:
-            raise ValueError(f"model.memory_frames is {self.memory_frames}; it must be at least 1.")
+        if self.follow_movers and self.memory_frames <= FLOW_LAGS:
+            raise ValueError(f"model.follow_movers compares the newest observation with {FLOW_LAGS} before it, but "
+                             f"model.memory_frames is {self.memory_frames}; set it to {FLOW_LAGS + 1} or more.")
         self._check_variant()
 
     def _check_variant(self):

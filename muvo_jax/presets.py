@@ -49,6 +49,8 @@ def town() -> config_lib.Config:
         occupancy_blocks=0,
         occupancy_token_stages=0,
         first_guess="last_seen",
+        follow_movers=True,
+        occupied_above=0.3,
         guided_channels=(64, 64, 64),
         action_path="recurrence",
         route_encoder="small",

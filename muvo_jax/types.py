@@ -202,7 +202,8 @@ class Memory(_Indexable):
       range_view: float32 [B, F, Hr, Wr, 4], as Batch.range_view; without lidar there is no memory.
       image: uint8 [B, F, H, W, 3], as Batch.image; None for a model without camera.
       intrinsics, camera_to_ego: float32 [B, 3, 3] and [B, 4, 4]; None without image.
-      evidence: float32 [B, X', Y', 2 Z] for voxels, worked out once for many states (memory.with_evidence); or None.
+      evidence: float32 [B, X', Y', 2 Z] for voxels, worked out once for many states (glimpse.with_evidence); or None.
+      onward: float32 [B, S, X', Y', Z], beside it what moves, S steps ahead (glimpse.VoxelGlimpse); or None.
     """
 
     pose: Array
@@ -211,6 +212,7 @@ class Memory(_Indexable):
     intrinsics: Array | None = None
     camera_to_ego: Array | None = None
     evidence: Array | None = None
+    onward: Array | None = None
 
 
 @flax.struct.dataclass

@@ -18,8 +18,7 @@ import numpy as np
 
 from muvo_jax.agents import environment as environment_lib
 from muvo_jax.agents import planners
-from muvo_jax.model import live
-from muvo_jax.model import memory as memory_lib
+from muvo_jax.model import glimpse, live
 from muvo_jax.ops import motion as motion_ops
 from muvo_jax.types import Array, ArrayLike, LatentState, Memory, Variables
 
@@ -201,7 +200,7 @@ def plan_step(environment: environment_lib.Environment, planner: str, config: pl
                                  sampled=False)
     speed_mps, route_map = observation["speed_mps"], observation.get("route_map")
     model_config = environment.model.config
-    remembered = memory_lib.with_evidence(model_config, filtered.memory, filtered.latent.vantage)  # one for all plans
+    remembered = glimpse.with_evidence(model_config, filtered.memory, filtered.latent.vantage)  # one for all plans
     bank = environment_lib.StartBank(filtered.latent, speed_mps, route_map, remembered, jnp.zeros((1,), jnp.int32))
     horizon = memory.plan.shape[0]
     params = dataclasses.replace(environment.params(variables, bank, horizon), temperature=temperature)

@@ -1,75 +1,22 @@
-"""What was seen of late and how it looks from where a state is: the geometric memory (first_guess="last_seen").
+"""What was seen of late, and where a state stands to it: the geometric memory (first_guess="last_seen").
 
 Moving what the sensors showed by the motion of the car needs no learning, and says most of what the next frames show.
 So a model with this memory keeps its last observations as they came (types.Memory, beside the states, once for all
 that is imagined from them), its states know where they stand to it (types.Vantage), and its decoders see the memory as
-it looks from there: `look`. What a state's own observation showed is hidden from its decoders: copying it would teach
-nothing. docs/memory.md says what this brings and what it cannot do.
+it looks from there (glimpse.py). docs/memory.md says what this brings and what it cannot do.
 """
 
 from __future__ import annotations
 
 import dataclasses
 
-import flax.struct
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from muvo_jax.config import NO_SENSOR, ModelConfig
-from muvo_jax.geometry import VoxelGrid
 from muvo_jax.ops import motion as motion_ops
-from muvo_jax.ops import reproject
-from muvo_jax.types import RANGE_NO_RETURN_M, UNTIMED_FIELDS, Array, Batch, LatentState, Memory, Motion, Vantage
-
-FADE = 0.8  # weight of evidence that is one observation older: what moved away is forgotten
-
-
-@flax.struct.dataclass
-class ImageGlimpse:
-    """The memory of the head image from n vantages, at full size.
-
-    Attributes:
-      image: float32 [n, H, W, 3] in [0, 1], the newest image moved, and `covered` [n, H, W, 1], 1 where it was seen.
-    """
-
-    image: Array
-    covered: Array
-
-
-@flax.struct.dataclass
-class RangeGlimpse:
-    """The memory of the head range_view from n vantages, at full size.
-
-    Attributes:
-      moved_m, newest_m, still_m: float32 [n, Hr, Wr] ranges, -1 where nothing is: all scans moved, the newest moved,
-        and the newest as it was.
-      filled_m: float32 [n, Hr, Wr], moved_m with its small holes filled.
-      sky: float32 [n, Hr, Wr], 1 where a pixel without a return came to lie.
-      height_m: float32 [n, Hr, Wr], of the moved returns over the road.
-    """
-
-    moved_m: Array
-    newest_m: Array
-    still_m: Array
-    filled_m: Array
-    sky: Array
-    height_m: Array
-
-
-@flax.struct.dataclass
-class VoxelGlimpse:
-    """The memory of the head occupancy from n vantages, at full size.
-
-    Attributes:
-      newest, older: float32 [n, X, Y, Z] in [-1, 1], evidence of the newest scan and of all before it.
-    """
-
-    newest: Array
-    older: Array
-
-
-Glimpse = ImageGlimpse | RangeGlimpse | VoxelGlimpse
+from muvo_jax.types import UNTIMED_FIELDS, Array, Batch, LatentState, Memory, Motion, Vantage
 
 
 def guessed_heads(config: ModelConfig) -> tuple[str, ...]:
@@ -241,7 +188,7 @@ def check(config: ModelConfig, states: LatentState | Array, memory: Memory | Non
 def check_evidence(states: LatentState, memory: Memory | None) -> None:
     """Raises ValueError where concrete states are none that a memory `with_evidence` was made for; traced ones pass."""
     vantage = states.vantage
-    if memory is None or memory.evidence is None or vantage is None or _traced(vantage):
+    if memory is None or memory.evidence is None or vantage is None or traced(vantage):
         return
     newest, steps, last = memory.pose.shape[1] - 1, np.asarray(vantage.steps), np.asarray(vantage.last)
     if (steps < 1).any() or (last != newest).any():
@@ -250,135 +197,6 @@ def check_evidence(states: LatentState, memory: Memory | None) -> None:
                          f"{np.unique(last).tolist()}. Decode these with the memory as it was before with_evidence.")
 
 
-def _traced(vantage: Vantage) -> bool:
+def traced(vantage: Vantage) -> bool:
+    """Whether the numbers of a vantage cannot be looked at."""
     return isinstance(vantage.steps, jax.core.Tracer) or isinstance(vantage.last, jax.core.Tracer)
-
-
-def look(config: ModelConfig, memory: Memory, rows: Array, vantage: Vantage,
-         heads: tuple[str, ...]) -> tuple[dict[str, Glimpse], Array]:
-    """The memory as it looks from n vantages, for those of the heads that it can tell something.
-
-    Beside it, `numbers` [n, 5]: how far the car is from where the newest observation in sight was taken (forward, left,
-    turn; zeros where there is none), how many steps are imagined and how fast it is; about 1 where that is much.
-
-    Args:
-      config: of the model.
-      memory: of B drives.
-      rows: int32 [n], which of them each vantage belongs to.
-      vantage: [n].
-      heads: what is decoded.
-    """
-    heads = tuple(head for head in guessed_heads(config) if head in heads)
-    places = config.memory_frames
-    stop = vantage.last + (vantage.steps > 0)
-    index = stop[:, None] + jnp.arange(-places, 0, dtype=jnp.int32)[None]
-    known = (index >= vantage.first[:, None]) & (index >= 0)
-    index = jnp.clip(index, 0, memory.pose.shape[1] - 1)
-    pose = motion_ops.relative(jnp.broadcast_to(vantage.motion.pose[:, None], (*index.shape, 3)),
-                               memory.pose[rows[:, None], index])
-    glimpses: dict[str, Glimpse] = {}
-    if "occupancy" in heads:
-        glimpses["occupancy"] = _evidence(config, memory, rows, index, known, pose)
-    if "range_view" in heads or "image" in heads:
-        glimpses["range_view"] = view = _ranges(config, memory, rows, index, known, pose)
-        if "image" in heads:
-            glimpses["image"] = _image(config, memory, rows, index[:, -1], known[:, -1], pose[:, -1], view)
-    apart = jnp.where(known[:, -1:], pose[:, -1], 0.0) / jnp.array([10.0, 2.0, 0.3], jnp.float32).reshape(1, 3)
-    numbers = [apart, vantage.steps.astype(jnp.float32)[:, None] / 5.0, vantage.motion.speed_mps[:, None] / 10.0]
-    return {head: glimpses[head] for head in heads}, jnp.concatenate(numbers, axis=-1)
-
-
-def _ranges(config: ModelConfig, memory: Memory, rows: Array, index: Array, known: Array, pose: Array) -> RangeGlimpse:
-    geometry = config.range_view
-    scans = memory.range_view[rows[:, None], index]
-    scans = scans.reshape(*index.shape, -1, 4)
-    points_m = motion_ops.into_frame(scans[..., :3], pose)
-    valid = (scans[..., 3] > 0.0) & jnp.expand_dims(known, -1)
-    splat = lambda part: reproject.onto_beams(reproject.splat(
-        points_m[:, part].reshape(rows.shape[0], -1, 3), valid[:, part].reshape(rows.shape[0], -1), geometry), geometry)
-    moved = newest = splat(slice(-1, None))
-    if index.shape[1] > 1:
-        moved = jnp.where(newest[..., 3:] > 0.0, newest, splat(slice(None, -1)))
-    still = scans[:, -1].reshape(*newest.shape)
-    fresh = known[:, -1].reshape(-1, 1, 1)
-    sky = reproject.move_sky(still, pose[:, -1], geometry) & fresh & (moved[..., 3] <= 0.0)
-    filled_m = reproject.fill_holes(moved[..., 3], sky, geometry)
-    still_m = jnp.where(fresh, still[..., 3], RANGE_NO_RETURN_M)
-    height_m = jnp.where(moved[..., 3] > 0.0, moved[..., 2], 0.0)
-    return RangeGlimpse(moved_m=moved[..., 3], newest_m=newest[..., 3], filled_m=filled_m, still_m=still_m,
-                        sky=sky.astype(jnp.float32), height_m=height_m)
-
-
-def _image(config: ModelConfig, memory: Memory, rows: Array, index: Array, known: Array, pose: Array,
-           view: RangeGlimpse) -> ImageGlimpse:
-    assert memory.image is not None and memory.intrinsics is not None and memory.camera_to_ego is not None  # see check
-    images = memory.image.reshape(-1, *memory.image.shape[2:])
-    moved, inside = reproject.move_image(images, view.filled_m, pose, memory.intrinsics[rows],
-                                         memory.camera_to_ego[rows], config.range_view,
-                                         rows * memory.image.shape[1] + index)
-    covered = jnp.expand_dims((inside & known.reshape(-1, 1, 1)).astype(jnp.float32), -1)
-    return ImageGlimpse(image=moved / 255.0 * covered, covered=covered)
-
-
-def _evidence(config: ModelConfig, memory: Memory, rows: Array, index: Array, known: Array,
-              pose: Array) -> VoxelGlimpse:
-    if memory.evidence is not None:
-        both = reproject.move_voxels(memory.evidence, pose[:, -1], config.voxels, _wide(config.voxels), rows)
-        return VoxelGlimpse(*jnp.split(both, 2, axis=-1))
-    return VoxelGlimpse(*_scans_evidence(config, memory, rows, index, known, pose, config.voxels))
-
-
-def _scans_evidence(config: ModelConfig, memory: Memory, rows: Array, index: Array, known: Array, pose: Array,
-                    grid: VoxelGrid) -> tuple[Array, Array]:
-    """Evidence of the newest scan and of all before it, [n, X, Y, Z] each in [-1, 1].
-
-    A voxel that holds a return is occupied, as in the labels; the beam through its centre says the rest.
-    """
-    frames, places, view = memory.pose.shape[1], index.shape[1], config.range_view
-    flat_pose = pose.reshape(-1, 3)
-    scans_m = memory.range_view[..., 3].reshape(-1, view.rows, view.columns)
-    evidence = reproject.scan_evidence(scans_m, (rows[:, None] * frames + index).reshape(-1), flat_pose, grid, view)
-    scans = memory.range_view[rows[:, None], index].reshape(flat_pose.shape[0], -1, 4)
-    hits = reproject.hit_voxels(motion_ops.into_frame(scans[..., :3], flat_pose), scans[..., 3] > 0.0, grid)
-    evidence = jnp.where(hits > 0.0, 1.0, evidence).reshape(rows.shape[0], places, *grid.shape)
-    evidence = jnp.where(known.reshape(*known.shape, 1, 1, 1), evidence, 0.0)
-    weights = FADE ** jnp.arange(places - 2, -1, -1, dtype=jnp.float32).reshape(1, -1, 1, 1, 1)
-    return evidence[:, -1], jnp.clip((evidence[:, :-1] * weights).sum(axis=1), -1.0, 1.0)
-
-
-def with_evidence(config: ModelConfig, memory: Memory | None, vantage: Vantage | None) -> Memory | None:
-    """The memory with the evidence for voxels worked out once, for many states that are imagined from its newest
-    observation: a planner's. Resampled from there it is a little blurred, and ends half a grid beyond the grid.
-
-    What is decoded with it must be imagined, at least one step, from there: see check_evidence.
-
-    vantage: [B], of the states from which imagination starts; None where there is no memory.
-
-    Raises:
-      ValueError: if the vantage is not [B], or is concrete and not that of the newest observation.
-    """
-    if memory is None or vantage is None or "occupancy" not in config.heads:
-        return memory
-    drives, frames = memory.pose.shape[:2]
-    if jnp.shape(vantage.last) != (drives,):
-        raise ValueError(f"with_evidence: got a vantage {list(jnp.shape(vantage.last))}, expected [{drives}], a "
-                         f"start in each drive of the memory.")
-    if not _traced(vantage) and ((np.asarray(vantage.last) != frames - 1) | (np.asarray(vantage.steps) != 0)).any():
-        raise ValueError("with_evidence: the vantage is not that of the memory's newest observation; take it from "
-                         "observed.last or from the latent of a stream.")
-    places, rows = config.memory_frames, jnp.arange(memory.pose.shape[0])
-    newest = memory.pose.shape[1] + jnp.arange(-places, 0, dtype=jnp.int32)
-    index = jnp.broadcast_to(newest[None], (rows.shape[0], places))
-    known = (index >= vantage.first[:, None]) & (index >= 0)
-    index = jnp.maximum(index, 0)
-    pose = motion_ops.relative(jnp.zeros((*index.shape, 3)), memory.pose[rows[:, None], index])
-    evidence = _scans_evidence(config, memory, rows, index, known, pose, _wide(config.voxels))
-    return dataclasses.replace(memory, evidence=jnp.concatenate(evidence, axis=-1))
-
-
-def _wide(grid: VoxelGrid) -> VoxelGrid:
-    """The grid with half its length more on each side."""
-    x, y, z = grid.shape
-    low_x, low_y, low_z = grid.origin_m
-    return VoxelGrid((2 * x, 2 * y, z), grid.voxel_size_m,
-                     (low_x - 0.5 * x * grid.voxel_size_m, low_y - 0.5 * y * grid.voxel_size_m, low_z))

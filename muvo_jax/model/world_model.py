@@ -22,17 +22,7 @@ import jax.numpy as jnp
 from flax import linen
 
 from muvo_jax.config import NO_SENSOR, ModelConfig
-from muvo_jax.model import (
-    camera,
-    fusion,
-    guided,
-    heads,
-    lidar,
-    measurements,
-    outputs,
-    tokens,
-    transition,
-)
+from muvo_jax.model import camera, fusion, glimpse, guided, heads, lidar, measurements, outputs, tokens, transition
 from muvo_jax.model import memory as memory_lib
 from muvo_jax.nn import init as init_lib
 from muvo_jax.nn import layers, norm
@@ -114,11 +104,11 @@ class Network(linen.Module):
 
     def decode(self, features: jax.Array, vantage: Vantage | None, memory: Memory | None, rows: jax.Array | None,
                names: tuple[str, ...]) -> dict[str, dict[int, jax.Array]]:
-        glimpses: dict[str, memory_lib.Glimpse] = {}
+        glimpses: dict[str, glimpse.Glimpse] = {}
         numbers = None
         if memory is not None:
             assert vantage is not None and rows is not None  # as memory.check returns them
-            glimpses, numbers = memory_lib.look(self.config, memory, rows, vantage, names)
+            glimpses, numbers = glimpse.look(self.config, memory, rows, vantage, names)
         raw = {}
         for name in names:
             read = self.read(features, name)

@@ -19,6 +19,7 @@ from muvo_jax.types import RANGE_NO_RETURN_M, Array
 
 FAR_M = 1000.0  # where a pixel without a return is taken to look; only turning moves it
 GROUND_M = 0.3  # returns below this height over the road are ground
+_MIDDLE = 0.1  # so much of a pixel beside its middle still counts as there
 
 
 def move_range_view(range_view: Array, pose: Array, geometry: RangeViewGeometry) -> Array:
@@ -174,9 +175,26 @@ def onto_beams(range_view: Array, geometry: RangeViewGeometry) -> Array:
     ground = (range_view[..., 2] < GROUND_M) & (beams[..., 2] < -0.02)
     flat_m = jnp.sqrt(jnp.maximum(range_view[..., 3] ** 2 - height_m**2, 1e-6))
     range_m = jnp.where(ground, height_m / down, flat_m / jnp.sqrt(1.0 - beams[..., 2] ** 2))
-    points_m = beams * jnp.expand_dims(range_m, -1) + _lidar_m(geometry)[None]
-    moved = jnp.concatenate([points_m, jnp.expand_dims(range_m, -1)], axis=-1)
+    moved = jnp.concatenate([beam_points(range_m, geometry), jnp.expand_dims(range_m, -1)], axis=-1)
     return jnp.where(range_view[..., 3:] > 0.0, moved, range_view)
+
+
+def lies_on_beams(range_view: Array, geometry: RangeViewGeometry) -> Array:
+    """Whether a scan's returns [N, Hr, Wr, 4] lie in the middle of their pixels, bool [N].
+
+    So it is with a simulated lidar of as many beams. A pixel that holds one of several returns has it anywhere.
+    """
+    away_m = jnp.linalg.norm(range_view[..., :3] - beam_points(range_view[..., 3], geometry), axis=-1)
+    pixel_m = range_view[..., 3] * (2.0 * math.pi / geometry.columns)
+    returned = range_view[..., 3] > 0.0
+    middle = (returned & (away_m < _MIDDLE * pixel_m)).sum(axis=(1, 2))
+    return 2 * middle > returned.sum(axis=(1, 2))
+
+
+def beam_points(range_m: Array, geometry: RangeViewGeometry) -> Array:
+    """The points [N, Hr, Wr, 3] (ego frame) in the middle of the pixels at ranges [N, Hr, Wr]."""
+    beams = jnp.asarray(range_view_ops.beam_directions(geometry))[None]
+    return beams * jnp.expand_dims(range_m, -1) + _lidar_m(geometry)[None]
 
 
 def fill_holes(range_m: Array, sky: Array, geometry: RangeViewGeometry, rounds: int = 2) -> Array:

@@ -14,7 +14,7 @@ from muvo_jax import config as config_lib
 from muvo_jax import presets
 from muvo_jax.agents import environment as environment_lib
 from muvo_jax.agents import planners, rewards
-from muvo_jax.model import live, memory, rollout, world_model
+from muvo_jax.model import glimpse, live, memory, rollout, world_model
 from muvo_jax.ops import camera, motion, range_view, reproject
 from muvo_jax.types import Batch, LatentState
 
@@ -85,7 +85,7 @@ def batch_of(config, batch_size=BATCH, frames=FRAMES, speed_mps=None, **fields):
 
 
 KEY = jax.random.key(5)
-look = jax.jit(memory.look, static_argnums=(0, 4))
+look = jax.jit(glimpse.look, static_argnums=(0, 4))
 
 
 def observe(model, variables, batch, **options):
@@ -324,7 +324,7 @@ def test_evidence_worked_out_once_says_nearly_the_same_and_only_of_what_is_imagi
     model = model_of()
     batch = batch_of(model.config, speed_mps=6.0)
     observed = observe(model, trained(model), batch)
-    ready = memory.with_evidence(model.config, observed.memory, observed.last.vantage)
+    ready = glimpse.with_evidence(model.config, observed.memory, observed.last.vantage)
     dream = rollout.imagine(model, trained(model), KEY, observed.last, np.zeros((BATCH, 2, 2), np.float32))
     of = lambda held, states: rollout.decode(model, trained(model), states, ("occupancy",), memory=held).occupancy
     exact, quick = (np.asarray(of(held, dream.states)) for held in (observed.memory, ready))
@@ -335,9 +335,9 @@ def test_evidence_worked_out_once_says_nearly_the_same_and_only_of_what_is_imagi
     with pytest.raises(ValueError, match=r"states \[1, 2\] steps .* from observations \[1\]"):
         of(ready, earlier.states)
     with pytest.raises(ValueError, match="not that of the memory's newest observation"):
-        memory.with_evidence(model.config, observed.memory, observed.states[:, 1].vantage)
+        glimpse.with_evidence(model.config, observed.memory, observed.states[:, 1].vantage)
     with pytest.raises(ValueError, match=r"got a vantage \[2, 4\], expected \[2\]"):
-        memory.with_evidence(model.config, observed.memory, observed.states.vantage)
+        glimpse.with_evidence(model.config, observed.memory, observed.states.vantage)
 
 
 def environment_of(model, observed, batch, **options):

@@ -94,7 +94,7 @@ def plan_drive(options: Options, show: screen.Screen) -> dict[str, Any]:
     world = town_simulator(town, config)
     imagination = environment.Environment.of_run(loaded, reward_config=rewards.RewardConfig(
         occupancy_scale=options.occupancy_scale, speed_limit_mps=options.speed_limit_mps,
-        **({} if "occupancy" in config.model.heads else {"collision": 0.0})))
+        collision=rewards.RewardConfig.collision if "occupancy" in config.model.heads else 0.0))
     planner = closed_loop.planning_driver(world, imagination, loaded.variables, *planner_of(options),
                                           horizon=options.horizon, shared_future=options.futures == "one")
     drivers = {PLANNED: planner, EXPERT: closed_loop.expert_driver(world),

@@ -293,15 +293,18 @@ def weighed(moment: Moment, touched: Array | None, *, contract: config_lib.Actio
             config: RewardConfig) -> tuple[Array, Array, dict[str, Array]]:
     """The driving reward where the collision probability `touched` [...] is known; None leaves it out.
 
-    reward = progress * min(progress_m / (limit * step_s), 1) - collision * max(0, p - q) / (1 - q)
-             - comfort * discomfort - speeding * speeding, q being config.tolerated_collision
+    reward = progress * progress_m / (limit * step_s) - collision * max(0, p - q) / (1 - q)
+             - comfort * discomfort - speeding * speeding, q being config.tolerated_collision; gains above the limit
+             are divided by speed / limit
 
     Returns:
       reward [...], terminated bool [...] (p above config.terminal_collision), and the terms by name.
     """
     terms = {"progress_m": progress_m(moment, config), "discomfort": discomfort(moment, contract, step_s, config),
              "speeding": speeding(moment, config)}
-    reward = (config.progress * jnp.minimum(terms["progress_m"] / (config.speed_limit_mps * step_s), 1.0)
+    gained = terms["progress_m"] / (config.speed_limit_mps * step_s)
+    fast = jnp.maximum(moment.after.speed_mps / config.speed_limit_mps, 1.0)
+    reward = (config.progress * jnp.where(gained > 0.0, gained / fast, gained)
               - config.comfort * terms["discomfort"] - config.speeding * terms["speeding"])
     if touched is None:
         return reward, jnp.zeros(reward.shape, jnp.bool_), terms

@@ -31,6 +31,7 @@ def map_of(line_m):
     return route.follow(jnp.asarray(drawn), config_lib.RouteMap())
 
 
+LINE_Y_M = -0.375  # where the map's pixels have the middle of a line at y = 0
 STRAIGHT = map_of(np.stack([np.arange(-15, 45, 0.5), np.zeros(120)], axis=1))
 
 
@@ -181,7 +182,7 @@ def test_progress_fades_with_the_distance_from_the_route():
 
 
 def test_driving_back_along_the_painted_route_loses_what_driving_on_gains():
-    on, back = (driven(through((0, 0), (end, 0)))[0] for end in (10, -10))
+    on, back = (driven(through((0, LINE_Y_M), (end, LINE_Y_M)))[0] for end in (10, -10))
     np.testing.assert_allclose(on, 1.0, rtol=0.05)
     np.testing.assert_allclose(back, -1.0, rtol=0.05)
     _, terms = driven(through((0, 0), (-10, 0)), line=None)  # no map: along the heading of the start

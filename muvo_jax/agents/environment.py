@@ -255,9 +255,9 @@ class Environment:
             raise ValueError(f"StartBank: it has no memory, but the heads {', '.join(guessed)} of this model look at "
                              f"what was seen of late; make it of what `observe` returned (Environment.starts).")
         routes = None if bank.route_map is None else _follow(jnp.asarray(bank.route_map), self.reward_config.route)
-        seen = None
-        if self._tests_collisions and bank.memory is not None and bank.row is not None:
-            seen = _seen(bank.memory.range_view, bank.row, bank.latent.vantage.last, self.model.config.voxels,
+        seen, vantage = None, bank.latent.vantage
+        if self._tests_collisions and bank.memory is not None and bank.row is not None and vantage is not None:
+            seen = _seen(bank.memory.range_view, bank.row, vantage.last, self.model.config.voxels,
                          self.reward_config.box)
         return EnvParams(jax.tree.map(jnp.asarray, variables), bank, jnp.int32(horizon), jnp.float32(temperature),
                          routes, seen)

@@ -13,6 +13,7 @@ from typing import NamedTuple
 import flax.struct
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from muvo_jax.config import LastSeen, ModelConfig, as_kind
 from muvo_jax.geometry import VoxelGrid
@@ -246,10 +247,23 @@ def with_evidence(config: ModelConfig, memory: Memory | None, vantage: Vantage |
     """The memory with the evidence for voxels worked out once, for many states that are imagined from its newest
     observation: a planner's. Resampled from there it is a little blurred, and ends half a grid beyond the grid.
 
+    What is decoded with it must be imagined, at least one step, from there: see memory.check_evidence.
+
     vantage: [B], of the states from which imagination starts; None where there is no memory.
+
+    Raises:
+      ValueError: if the vantage is not [B], or is concrete and not that of the newest observation.
     """
     if memory is None or vantage is None or "occupancy" not in config.heads:
         return memory
+    drives, frames = memory.pose.shape[:2]
+    if jnp.shape(vantage.last) != (drives,):
+        raise ValueError(f"with_evidence: got a vantage {list(jnp.shape(vantage.last))}, expected [{drives}], a "
+                         f"start in each drive of the memory.")
+    elsewhere = lambda: (np.asarray(vantage.last) != frames - 1) | (np.asarray(vantage.steps) != 0)
+    if not memory_lib.traced(vantage) and elsewhere().any():
+        raise ValueError("with_evidence: the vantage is not that of the memory's newest observation; take it from "
+                         "observed.last or from the latent of a stream.")
     guess = as_kind(config.first_guess, LastSeen)
     places, rows = guess.memory_frames, jnp.arange(memory.pose.shape[0])
     newest = memory.pose.shape[1] + jnp.arange(-places, 0, dtype=jnp.int32)

@@ -12,6 +12,7 @@ import dataclasses
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from muvo_jax.config import LastSeen, ModelConfig
 from muvo_jax.ops import motion as motion_ops
@@ -171,6 +172,7 @@ def check(config: ModelConfig, states: LatentState | Array, memory: Memory | Non
             raise ValueError(f"decode: memory.{name} is {None if value is None else list(value.shape)}, expected "
                              f"{list(expected)} beside memory.pose {list(memory.pose.shape)}; this memory belongs to "
                              f"another model or is of two.")
+    check_evidence(states, memory)
     flat = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[len(lead):]), states.vantage)
     count = flat.last.shape[0]
     if rows is not None:
@@ -182,3 +184,20 @@ def check(config: ModelConfig, states: LatentState | Array, memory: Memory | Non
         raise ValueError(f"decode: got states [{', '.join(map(str, (*lead, '...')))}] and a memory of {drives} drives; "
                          f"the first axis of the states must count the drives. Pass rows= otherwise.")
     return flat, jnp.repeat(jnp.arange(drives, dtype=jnp.int32), count // drives)
+
+
+def check_evidence(states: LatentState, memory: Memory | None) -> None:
+    """Raises ValueError where concrete states are none that a memory `with_evidence` was made for; traced ones pass."""
+    vantage = states.vantage
+    if memory is None or memory.evidence is None or vantage is None or traced(vantage):
+        return
+    newest, steps, last = memory.pose.shape[1] - 1, np.asarray(vantage.steps), np.asarray(vantage.last)
+    if (steps < 1).any() or (last != newest).any():
+        raise ValueError(f"decode: the memory's evidence holds for states imagined from its newest observation, number "
+                         f"{newest}; got states {np.unique(steps).tolist()} steps (0: not imagined) from observations "
+                         f"{np.unique(last).tolist()}. Decode these with the memory as it was before with_evidence.")
+
+
+def traced(vantage: Vantage) -> bool:
+    """Whether the numbers of a vantage cannot be looked at."""
+    return isinstance(vantage.steps, jax.core.Tracer) or isinstance(vantage.last, jax.core.Tracer)

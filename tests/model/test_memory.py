@@ -318,6 +318,26 @@ def test_without_kinematics_measured_motion_counts():
                     {head: value[:, t] for head, value in whole.items()})
 
 
+def test_evidence_worked_out_once_says_nearly_the_same_and_only_of_what_is_imagined_from_the_newest_observation():
+    model = model_of()
+    batch = batch_of(model.config, speed_mps=6.0)
+    observed = observe(model, trained(model), batch)
+    ready = glimpse.with_evidence(model.config, observed.memory, observed.last.vantage)
+    dream = rollout.imagine(model, trained(model), KEY, observed.last, np.zeros((BATCH, 2, 2), np.float32))
+    of = lambda held, states: rollout.decode(model, trained(model), states, ("occupancy",), memory=held).occupancy
+    exact, quick = (np.asarray(of(held, dream.states)) for held in (observed.memory, ready))
+    assert np.corrcoef(exact.ravel(), quick.ravel())[0, 1] > 0.9
+    with pytest.raises(ValueError, match=r"states \[0\] steps \(0: not imagined\) from observations \[3\]"):
+        of(ready, observed.states[:, -1:])
+    earlier = rollout.imagine(model, trained(model), KEY, observed.states[:, 1], np.zeros((BATCH, 2, 2), np.float32))
+    with pytest.raises(ValueError, match=r"states \[1, 2\] steps .* from observations \[1\]"):
+        of(ready, earlier.states)
+    with pytest.raises(ValueError, match="not that of the memory's newest observation"):
+        glimpse.with_evidence(model.config, observed.memory, observed.states[:, 1].vantage)
+    with pytest.raises(ValueError, match=r"got a vantage \[2, 4\], expected \[2\]"):
+        glimpse.with_evidence(model.config, observed.memory, observed.states.vantage)
+
+
 def environment_of(model, observed, batch, **options):
     environment = environment_lib.Environment(model, periods=2, observation=("image",), **options)
     return environment, environment.params(trained(model), environment.starts(observed, batch, skip=1), 3)
@@ -327,7 +347,7 @@ def test_an_environment_sees_the_memory_of_its_start():
     model = model_of()
     batch = batch_of(model.config)
     observed = observe(model, trained(model), batch)
-    environment, params = environment_of(model, observed, batch, reward_config=rewards.RewardConfig(occupancy_scale=4))
+    environment, params = environment_of(model, observed, batch, reward_config=rewards.RewardConfig(occupancy_scale=2))
     assert params.bank.size == BATCH * (FRAMES - 1) and params.bank.row.tolist() == [0, 0, 0, 1, 1, 1]
     assert params.bank.memory is observed.memory
     params = dataclasses.replace(params, temperature=jnp.float32(0.0))

@@ -24,7 +24,7 @@ import tyro
 from muvo_jax import late
 
 with late.imports():
-    from muvo_jax.data import sources
+    from muvo_jax import recordings
     from muvo_jax.training import checkpoint, host, screen
 
 if TYPE_CHECKING:
@@ -206,6 +206,6 @@ def which_checkpoint(text: str) -> str | int:
 
 
 def open_data(config: config_lib.Config, show: screen.Screen) -> schema.Recording:
-    """The recording that a config names (sources.open_configured), with a progress bar where the town is recorded."""
+    """The recording that a config names, with a progress bar where the town is recorded."""
     with show.counter("recording the built-in town", "frames") as progress:
-        return sources.open_configured(config, progress)
+        return recordings.open_configured(config, progress)

@@ -124,6 +124,8 @@ class ModelConfig:
         step that they cause enter the recurrence too, and the start of every token.
       kinematics: what actions do, where they describe the motion; Config fills it in from contract and stride.
       range_view_points: "beams": x, y, z are drawn as the difference from the point along the pixel's beam.
+      occupied_above: a voxel is called occupied where its probability is above this. Most voxels are empty, and the
+        decision that overlaps best is below one half: at the intersection over union J that it reaches, J / (1 + J).
       compute_dtype: of the matrix work; parameters, norms, softmax and losses stay float32.
       convolution: "auto" takes the forms of ops/conv.py that are fast on this backend, "xla" the plain ones (needed for
         forward-mode differentiation), "gemm" the CPU forms.
@@ -176,6 +178,7 @@ class ModelConfig:
     action_path: Literal["prior", "recurrence"] = "prior"
     kinematics: Kinematics | None = None
     range_view_points: Literal["free", "beams"] = "free"
+    occupied_above: Annotated[float, Limits(0, 1, open_low=True, open_high=True)] = 0.5
     compute_dtype: Literal["float32", "bfloat16"] = "float32"
     convolution: Literal["auto", "xla", "gemm"] = "auto"
     range_scale_m: Annotated[float, above(0, unit="m")] = 50.0

@@ -16,7 +16,8 @@ from muvo_jax import command_line, late
 with late.imports():
     from muvo_jax import config as config_lib
     from muvo_jax import presets
-    from muvo_jax.data import checkup, files, prepare, schema, sources, words
+    from muvo_jax.data import fitting, prepare, schema, sequences, sources, words
+    from muvo_jax.data.checkup import examination, judgements
     from muvo_jax.ops import voxels as voxel_ops
     from muvo_jax.training import screen
     from muvo_jax.viz import canvas, checks
@@ -49,7 +50,7 @@ python -m muvo_jax.doctor recordings/mine --out=look
 """
 
 
-def examine(options: Options, show: screen.Screen) -> checkup.Checkup:
+def examine(options: Options, show: screen.Screen) -> examination.Checkup:
     """Does what the command line asks for.
 
     Raises:
@@ -60,14 +61,14 @@ def examine(options: Options, show: screen.Screen) -> checkup.Checkup:
     try:
         recording, warned = open_recording(options.path, options.camera)
     except schema.DataError as error:
-        described, result = None, checkup.refused(f"{name} ({kind.name})", error)
+        described, result = None, examination.refused(f"{name} ({kind.name})", error)
     else:
         described = recording.description
-        problems, gaps = ([text for category, text in warned if issubclass(category, files.GapWarning) == is_gap]
+        problems, gaps = ([text for category, text in warned if issubclass(category, sequences.GapWarning) == is_gap]
                           for is_gap in (False, True))
         with show.counter("looking at", "frames") as progress:
-            result = checkup.examine(recording, problems, frames=options.frames, workers=options.workers, gaps=gaps,
-                                     progress=progress)
+            result = examination.examine(recording, problems, frames=options.frames, workers=options.workers, gaps=gaps,
+                                         progress=progress)
         result = result.with_problems(refusals(recording, result))
     out = (options.out or pathlib.Path("doctor") / name).expanduser()
     for fact, value in result.facts.items():
@@ -91,11 +92,11 @@ def open_recording(path: pathlib.Path, camera: str = "") -> tuple[schema.Recordi
                        if issubclass(warning.category, schema.DataWarning)]
 
 
-def refusals(recording: schema.Recording, result: checkup.Checkup) -> list[str]:
+def refusals(recording: schema.Recording, result: examination.Checkup) -> list[str]:
     """Why training would not take the recording as it is; empty where it would."""
     try:
-        config = prepare.adapt(presets.get("town"), recording).config
-        prepare.check_targets(config, recording.description)
+        config = fitting.adapt(presets.get("town"), recording).config
+        fitting.check_targets(config, recording.description)
         for sample in result.pictures:
             prepare.prepare_frame(sample.frame, config)
     except ValueError as error:  # DataError too
@@ -103,7 +104,7 @@ def refusals(recording: schema.Recording, result: checkup.Checkup) -> list[str]:
     return []
 
 
-def draw(described: schema.RecordingDescription, result: checkup.Checkup, out: pathlib.Path) -> list[pathlib.Path]:
+def draw(described: schema.RecordingDescription, result: examination.Checkup, out: pathlib.Path) -> list[pathlib.Path]:
     """Writes overlays of a few frames, and the actions beside the motion of the first stretch that moves."""
     written = []
     every = len(result.pictures)
@@ -144,13 +145,13 @@ def _voxels(frame: schema.RawFrame, described: schema.RecordingDescription):
     return voxel_ops.occupancy_target(frame["points_m"], lidar_m, grid), grid
 
 
-def _liveliest(motion: checkup.judgements.DrivingLog) -> int:
+def _liveliest(motion: judgements.DrivingLog) -> int:
     """The stretch that steers most."""
     numbers = np.unique(motion.stretch)
     return int(max(numbers, key=lambda number: motion.action[motion.stretch == number, 1].std()))
 
 
-def write_report(out: pathlib.Path, result: checkup.Checkup, pictures: list[pathlib.Path]) -> pathlib.Path:
+def write_report(out: pathlib.Path, result: examination.Checkup, pictures: list[pathlib.Path]) -> pathlib.Path:
     """OUT/report.md."""
     lines = ["# What is there", "", "| | |", "|---|---|", *(f"| {name} | {value} |" for name, value in
                                                             result.facts.items()), ""]

@@ -112,7 +112,7 @@ def choose_window(recording: schema.Recording, config: config_lib.Config, option
         raise ValueError(f"--sequence: split {split!r} has no {options.sequence!r}; it has {known}.")
     sequence = max(named, key=lambda candidate: candidate.length)
     frames = data.context + data.horizon
-    last = sequence.length - prepare_lib.span(frames, data.stride)
+    last = sequence.length - windows.span(frames, data.stride)
     start = max(last, 0) // 2 if options.start is None else options.start
     if not 0 <= start <= last:
         raise ValueError(f"--start {start}: sequence {sequence.name!r} has {sequence.length} frames; {frames} frames, "
@@ -145,7 +145,7 @@ def dream_window(model: world_model.WorldModel, variables: types.Variables, key:
         join = lambda seen, dreamt, branch=branch: jax.numpy.concatenate([seen, dreamt[:, branch]], axis=1)
         states = jax.tree.map(join, observed.states, imagined.states)
         decoded = rollout.decode(model, variables, states, heads, memory=observed.memory)
-        futures.append(jax.device_get(protocol.finish(decoded)))
+        futures.append(jax.device_get(protocol.finish(decoded, model.config)))
     return futures
 
 

@@ -16,7 +16,7 @@ with late.imports():
 
     from muvo_jax import config as config_lib
     from muvo_jax import evaluation_report
-    from muvo_jax.data import pipeline, prepare
+    from muvo_jax.data import fitting, pipeline
     from muvo_jax.metrics import protocol
     from muvo_jax.model import world_model
     from muvo_jax.training import checkpoint_meta, screen, validation
@@ -104,7 +104,7 @@ def fit(config: config_lib.Config, recording, chosen: tuple[str, ...]) -> config
     Raises:
       ValueError: naming both where the recording asks for another network.
     """
-    fitted = prepare.adapt(config, recording, keep=chosen).config
+    fitted = fitting.adapt(config, recording, keep=chosen).config
     where = f"recording {recording.description.name!r} asks for another model than this run, which"
     checkpoint_meta.check_architecture(fitted, config, where)
     return fitted

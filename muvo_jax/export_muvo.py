@@ -12,7 +12,8 @@ import tyro
 from muvo_jax import command_line, late
 
 with late.imports():
-    from muvo_jax.data import muvo_export, words
+    from muvo_jax.data import words
+    from muvo_jax.data.muvo import exporter as muvo_exporter
     from muvo_jax.training import screen
 
 
@@ -40,7 +41,7 @@ python -m muvo_jax.export_muvo recordings/carla muvo_data --town=Town05
 def export(options: Options, show: screen.Screen) -> None:
     """Does what the command line asks for."""
     with show.counter("writing", "frames") as progress:
-        count = muvo_export.export(options.source, options.out, town=options.town, progress=progress)
+        count = muvo_exporter.export(options.source, options.out, town=options.town, progress=progress)
     show.line(f"wrote {words.counted(count, 'frame')} to {options.out}.")
 
 

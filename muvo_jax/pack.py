@@ -13,7 +13,9 @@ import tyro
 from muvo_jax import command_line, late
 
 with late.imports():
-    from muvo_jax.data import manifest, records, shards, words
+    from muvo_jax.data import words
+    from muvo_jax.data.packed import manifest, records
+    from muvo_jax.data.packed import writer as packed_writer
     from muvo_jax.training import screen
 
 _EXAMPLES = """
@@ -55,7 +57,7 @@ def pack(options: Options, show: screen.Screen) -> None:
     """Packs and says what there is."""
     start_s = time.perf_counter()
     with show.counter("packing", "frames") as progress:
-        complete = shards.pack(
+        complete = packed_writer.pack(
             options.source, options.out, frames_per_shard=options.frames_per_shard, camera=options.camera,
             labels=options.labels, encoding=records.Encoding(options.jpeg_quality, options.half_points),
             machine=options.machine, machines=options.machines, workers=options.workers, progress=progress)

@@ -25,9 +25,9 @@ with late.imports():
     from muvo_jax import run as run_lib
     from muvo_jax.agents import closed_loop, environment, planners, rewards, sensitivity
     from muvo_jax.data import prepare, words
-    from muvo_jax.data.town import record, settings, simulator
     from muvo_jax.metrics import protocol, warp
     from muvo_jax.model import rollout
+    from muvo_jax.town import record, settings, simulator
     from muvo_jax.training import checkpoint_meta, screen
     from muvo_jax.viz import canvas, sheets
 
@@ -218,7 +218,7 @@ def film(loaded: run_lib.Run, town: simulator.Town, drive: closed_loop.Drive,
     views = []
     for latent in (states, jax.tree.map(lambda leaf: leaf[:, -1], dreamt.states)):
         decoded = rollout.decode(model, variables, latent, heads, memory=memory)
-        frames = jax.device_get(protocol.finish(decoded))
+        frames = jax.device_get(protocol.finish(decoded, model.config))
         views.append(sheets.views_of_frames({head: value[None] for head, value in frames.items()}, 0))
     scene = sheets.Scene.of(loaded.config)
     pictures = []

@@ -50,6 +50,7 @@ def town() -> config_lib.Config:
         occupancy_token_stages=0,
         first_guess="last_seen",
         follow_movers=True,
+        occupied_above=0.3,
         guided_channels=(64, 64, 64),
         action_path="recurrence",
         route_encoder="small",

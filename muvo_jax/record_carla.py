@@ -12,7 +12,10 @@ import tyro
 from muvo_jax import command_line, late
 
 with late.imports():
-    from muvo_jax.data import carla_client, carla_drives, carla_recorder, voxelizing, words
+    from muvo_jax.data import voxelizing, words
+    from muvo_jax.data.carla import client as carla_client
+    from muvo_jax.data.carla import drives as carla_drives
+    from muvo_jax.data.carla import recorder as carla_recorder
     from muvo_jax.training import screen
 
 

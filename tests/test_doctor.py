@@ -1,19 +1,16 @@
 """python -m muvo_jax.doctor as a user meets it: report, pictures and exit code."""
 
-import pathlib
 import re
 import shutil
 import sys
 
 import numpy as np
 import pytest
+import recording_samples as samples
+import recording_writers as writers
 from PIL import Image
 
 from muvo_jax import command_line, doctor
-
-sys.path.append(str(pathlib.Path(__file__).parent / "data"))
-import recording_samples as samples
-import recording_writers as writers
 
 
 def run(*arguments):

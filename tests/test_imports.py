@@ -30,37 +30,71 @@ ALLOWED = {
     "run": {"types", "config", "model"},
     "agents": BASE | {"nn", "model", "metrics", "run"},
     "data": BASE,
+    "town": BASE | {"data"},
+    "recordings": {"config", "data", "town"},
     "viz": BASE,
     "interop": BASE | {"nn", "model", "objectives", "metrics", "data", "training", "command_line", "late"},
-    "training": BASE | {"nn", "model", "run", "objectives", "metrics", "data"},
+    "training": BASE | {"nn", "model", "run", "objectives", "metrics", "data", "recordings"},
+}
+# Inside data: what every format shares, the formats, what finds them, and what makes batches of any of them.
+RECORDED = {"errors", "fields", "words", "schema", "sequences", "files", "description", "runs", "ego_motion",
+            "processes"}
+ALLOWED_IN_DATA = dict.fromkeys(RECORDED, RECORDED) | {
+    "plain": RECORDED,
+    "kitti": RECORDED,
+    "muvo": RECORDED | {"plain"},  # its exporter reads the plain format
+    "carla": RECORDED | {"plain", "muvo"},
+    "packed": RECORDED | {"sources"},  # its writer reads any format
+    "sources": RECORDED | {"plain", "kitti", "muvo", "packed"},
+    "voxelizing": RECORDED | {"plain", "muvo"},
+    "prepare": RECORDED,
+    "windows": RECORDED | {"prepare"},
+    "fitting": RECORDED | {"prepare", "windows"},
+    "pipeline": RECORDED | {"prepare", "windows"},
+    "checkup": RECORDED,
 }
 
 
-def modules_imported(path: pathlib.Path) -> set[str]:
-    """The first-level muvo_jax parts that a file imports, anywhere in it."""
+def modules_imported(path: pathlib.Path, package: str = "muvo_jax") -> set[str]:
+    """The first-level parts of a package that a file imports, anywhere in it."""
     found = set()
     for node in ast.walk(ast.parse(path.read_text())):
-        if isinstance(node, ast.ImportFrom) and (node.module or "").split(".")[0] == "muvo_jax":
-            parts = node.module.split(".")
-            found |= {parts[1]} if len(parts) > 1 else {alias.name for alias in node.names}
+        if isinstance(node, ast.ImportFrom) and node.module == package:
+            found |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom) and (node.module or "").startswith(f"{package}."):
+            found.add(node.module.removeprefix(f"{package}.").split(".")[0])
         elif isinstance(node, ast.Import):
-            found |= {alias.name.split(".")[1] for alias in node.names if alias.name.startswith("muvo_jax.")}
+            found |= {alias.name.removeprefix(f"{package}.").split(".")[0] for alias in node.names
+                      if alias.name.startswith(f"{package}.")}
     return found
+
+
+def parts(folder: pathlib.Path) -> set[str]:
+    """The packages and modules of a folder."""
+    return {path.stem for path in folder.iterdir() if (path / "__init__.py").exists() or path.suffix == ".py"}
+
+
+def stray_imports(folder: pathlib.Path, part: str, allowed: set[str], package: str) -> list[str]:
+    """What files of a part import that they may not."""
+    files = sorted((folder / part).rglob("*.py")) if (folder / part).is_dir() else [folder / f"{part}.py"]
+    assert files
+    return [f"{path.relative_to(PACKAGE)} imports {stray}" for path in files
+            if (stray := modules_imported(path, package) - allowed - {part})]
 
 
 @pytest.mark.parametrize("layer", sorted(ALLOWED))
 def test_layer_imports_only_what_lies_left_of_it(layer):
-    folder = PACKAGE / layer
-    files = sorted(folder.rglob("*.py")) if folder.is_dir() else [PACKAGE / f"{layer}.py"]
-    assert files
-    for path in files:
-        stray = modules_imported(path) - ALLOWED[layer] - {layer}
-        assert not stray, f"{path.relative_to(PACKAGE)} imports {stray}"
+    assert not stray_imports(PACKAGE, layer, ALLOWED[layer], "muvo_jax")
+
+
+@pytest.mark.parametrize("part", sorted(ALLOWED_IN_DATA))
+def test_part_of_data_imports_only_what_it_may(part):
+    assert not stray_imports(PACKAGE / "data", part, ALLOWED_IN_DATA[part], "muvo_jax.data")
 
 
 def test_every_part_of_the_package_has_its_place():
-    parts = {path.stem for path in PACKAGE.iterdir() if path.is_dir() and (path / "__init__.py").exists()}
-    assert parts <= set(ALLOWED)
+    assert {part for part in parts(PACKAGE) if (PACKAGE / part).is_dir()} <= set(ALLOWED)
+    assert parts(PACKAGE / "data") - {"__init__"} == set(ALLOWED_IN_DATA)
 
 
 def test_importing_the_library_loads_no_checkpoint_data_or_plotting_code():

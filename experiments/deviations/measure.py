@@ -16,12 +16,12 @@ import numpy as np
 
 from muvo_jax import config as config_lib
 from muvo_jax import geometry, presets, types
-from muvo_jax.data.town import settings
-from muvo_jax.data.town.simulator import Town
 from muvo_jax.metrics import points
 from muvo_jax.model import rollout, world_model
 from muvo_jax.objectives import kl, regression, scal
 from muvo_jax.ops import camera, frustum, pillars
+from muvo_jax.town import settings
+from muvo_jax.town.simulator import Town
 
 
 def gaussians(seed: int, frames: int) -> tuple[types.Gaussian, types.Gaussian]:

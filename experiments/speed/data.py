@@ -16,7 +16,6 @@ import pathlib
 import resource
 import tempfile
 import time
-import types
 from collections.abc import Callable
 
 import data_baselines
@@ -25,7 +24,10 @@ from PIL import Image
 
 from muvo_jax import config as config_lib
 from muvo_jax import presets
-from muvo_jax.data import pipeline, prepare, recorder, records, schema, shards, sources
+from muvo_jax.data import fitting, pipeline, prepare, schema, sources
+from muvo_jax.data.packed import manifest, records
+from muvo_jax.data.packed import writer as packed_writer
+from muvo_jax.data.plain import writer as plain_writer
 from muvo_jax.interop.weights_rule import make_input
 from muvo_jax.ops import camera, range_view, voxels
 
@@ -90,8 +92,9 @@ def packing(recording: schema.Recording) -> list[str]:
         lines.append(f"| {name}{', points in half' * encoding.half_points} | {sum(map(len, packed)) / count / 1e3:.1f} "
                      f"| {'exact' if math.isinf(quality) else f'{quality:.1f}'} | {off_m:.3f} |")
     with tempfile.TemporaryDirectory() as folder:
-        write_s = seconds(lambda: list(shards.write_shards(recording, pathlib.Path(folder), [0], count,
-                                                           records.Encoding())), 2)
+        shard = packed_writer.Shard(0, ((sequence, 0, count),), "")
+        write_s = seconds(lambda: list(packed_writer.write_shard(recording, pathlib.Path(folder), records.Encoding(),
+                                                                 shard)), 2)
     reading_s = seconds(lambda: [recording.read(sequence, index) for index in range(count)], 2)
     encoded = [records.encode_frame(frame, records.Encoding()) for frame in raw]
     decode_s = seconds(lambda: [records.decode_frame(record, "here") for record in encoded], 2)
@@ -100,19 +103,21 @@ def packing(recording: schema.Recording) -> list[str]:
 
 
 def peak_mib(folder: pathlib.Path, frames: int) -> float:
-    """Peak memory of a process of its own that packs so many frames (the recording again and again)."""
+    """Peak memory of a process of its own that packs so many frames (those of one sequence again and again)."""
     recording = sources.open_recording(folder)
-    length = sum(sequence.length for sequence in recording.sequences)
-    longer = types.SimpleNamespace(sequences=recording.sequences * math.ceil(frames / length), read=recording.read)
+    sequence, per_shard = recording.sequences[0], manifest.FRAMES_PER_SHARD
+    count = min(sequence.length, per_shard)
+    parts = ((sequence, 0, count),) * math.ceil(per_shard / count)
     with tempfile.TemporaryDirectory() as out:
-        numbers = list(range(frames // shards.FRAMES_PER_SHARD))
-        for _ in shards.write_shards(longer, pathlib.Path(out), numbers, shards.FRAMES_PER_SHARD, records.Encoding()):
-            pass
+        for number in range(frames // per_shard):
+            for _ in packed_writer.write_shard(recording, pathlib.Path(out), records.Encoding(),
+                                               packed_writer.Shard(number, parts, "")):
+                pass
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
 
 
 def packing_memory(folder: pathlib.Path) -> str:
-    lengths = (2 * shards.FRAMES_PER_SHARD, 10 * shards.FRAMES_PER_SHARD)
+    lengths = (2 * manifest.FRAMES_PER_SHARD, 10 * manifest.FRAMES_PER_SHARD)
     with multiprocessing.get_context("spawn").Pool(1, maxtasksperchild=1) as pool:
         peaks = [pool.apply(peak_mib, (folder, frames)) for frames in lengths]
     return "Peak memory of packing: " + ", ".join(f"{peak:.0f} MiB for {frames} frames" for peak, frames in
@@ -125,9 +130,9 @@ def write_paper_size(recording: schema.Recording, folder: pathlib.Path) -> schem
     intrinsics = camera.intrinsics_from_fov(960, 600, math.radians(110))
     pinhole = schema.Camera(960, 600, tuple(map(tuple, intrinsics.tolist())),
                             tuple(map(tuple, camera.level_camera_to_ego(lidar.position_m).tolist())))
-    recorder.write_description(folder, name="large", rate_hz=10.0, splits=("train",), camera=pinhole, lidar=lidar,
-                               voxels=grid, contract=recording.description.contract)
-    writer, rng = recorder.RunWriter(folder, "train", "run"), np.random.default_rng(0)
+    plain_writer.write_description(folder, name="large", rate_hz=10.0, splits=("train",), camera=pinhole, lidar=lidar,
+                                   voxels=grid, contract=recording.description.contract)
+    writer, rng = plain_writer.RunWriter(folder, "train", "run"), np.random.default_rng(0)
     points_m = make_input("rv_cloud", (60000,), "cloud").astype(np.float32)
     occupancy = voxels.occupancy_target(points_m, np.array(lidar.position_m, np.float32), grid)
     for index in range(FRAMES):
@@ -146,7 +151,7 @@ def windows_from_folder(recording: schema.Recording) -> str:
     """Training windows of 6 frames at the paper's size by the clock, and where a frame's processor time goes."""
     chosen = {"data.cache_gib": 0.0, "data.frames": 6, "data.context": 2, "data.horizon": 2, "data.stride": 1}
     wanted = config_lib.override_all(presets.get("paper-occupancy"), chosen)
-    config = prepare.adapt(wanted, recording, keep=chosen).config
+    config = fitting.adapt(wanted, recording, keep=chosen).config
     frames = pipeline.Frames(recording, config)
     batches = pipeline.train_batches(frames, seed=0, batch=1)
     for _ in range(2 * pipeline.default_workers() + 4):  # what was read ahead

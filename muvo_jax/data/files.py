@@ -1,7 +1,9 @@
-"""Single files of a recording, read with errors that name the file and how to fix it; runs cut at gaps."""
+"""Single files of a recording: read with errors that name the file and how to fix it, written whole or not at all."""
 
 from __future__ import annotations
 
+import io
+import json
 import os
 import pathlib
 import struct
@@ -10,17 +12,15 @@ import tomllib
 import warnings
 import zipfile
 import zlib
-from collections.abc import Iterable, Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from PIL import Image, ImageOps
 
-from muvo_jax.data import schema, words
+from muvo_jax.data import schema
 
 BAD_POINT_SHARE = 0.01  # more non-finite points than this are a broken file, not noise
-FEW_SHARE = 0.05  # gaps at no more frames than these (or at one) are what recordings have; more are a fault
 _NOT_FRAMES = ("Thumbs.db", "desktop.ini")
-GAP_PERIODS = 1.5  # a time step longer than this many periods is a gap
 # Pillow raises any of these for broken chunks and for sizes that would fill the memory.
 _IMAGE_ERRORS = (OSError, SyntaxError, ValueError, TypeError, IndexError, OverflowError, MemoryError, zlib.error,
                  struct.error, Image.DecompressionBombError)
@@ -190,67 +190,44 @@ def numbered(folder: pathlib.Path, suffixes: str | Sequence[str]) -> dict[int, s
     return found
 
 
-def check_increasing(timestamps_s: np.ndarray, where: Iterable[str]) -> None:
-    """Raises DataError at the first time stamp that is not later than the one before; `where` names each."""
-    steps = np.diff(timestamps_s)
-    wrong = np.flatnonzero(~(steps > 0))
-    if wrong.size:
-        index = int(wrong[0]) + 1
-        raise schema.DataError(f"{list(where)[index]}: time {timestamps_s[index]:.3f} s does not come after the frame "
-                               f"before it ({timestamps_s[index - 1]:.3f} s); time stamps must increase. Sort the "
-                               f"frames or remove the wrong ones.")
+def write_atomically(path: pathlib.Path, content: str | bytes) -> None:
+    """Writes a file such that it is there whole or not at all."""
+    draft = path.with_name(f".{path.name}.{os.getpid()}")
+    draft.write_bytes(content.encode() if isinstance(content, str) else content)
+    os.replace(draft, path)
 
 
-def after_gap(timestamps_s: np.ndarray, period_s: float) -> np.ndarray:
-    """bool [F], the frames that come more than 1.5 periods after the one before; NaN times are no gap."""
-    late = np.zeros(len(timestamps_s), bool)
-    late[1:] = np.diff(timestamps_s) > GAP_PERIODS * period_s
-    return late
+def npz_bytes(arrays: Mapping[str, np.ndarray]) -> bytes:
+    """An NPZ file, at the fastest compression: half the size of none, a third of the time of NumPy's.
 
-
-def gap_free(present: np.ndarray, breaks: np.ndarray) -> list[tuple[int, int]]:
-    """Cuts a run into (start, length) pieces.
-
-    Args:
-      present: bool [F], whether every sensor has the frame.
-      breaks: bool [F], frames that start a new piece in any case.
+    The archive's time stamps are fixed, so that equal arrays give equal bytes.
     """
-    pieces: list[tuple[int, int]] = []
-    start: int | None = None
-    for index in range(len(present)):
-        if start is not None and (breaks[index] or not present[index]):
-            pieces.append((start, index - start))
-            start = None
-        if start is None and present[index]:
-            start = index
-    if start is not None:
-        pieces.append((start, len(present) - start))
-    return pieces
+    content = io.BytesIO()
+    with zipfile.ZipFile(content, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
+        for name, array in arrays.items():
+            buffer = io.BytesIO()
+            np.lib.format.write_array(buffer, array, allow_pickle=False)
+            entry = zipfile.ZipInfo(f"{name}.npy")
+            entry.compress_type = zipfile.ZIP_DEFLATED
+            archive.writestr(entry, buffer.getbuffer(), compresslevel=1)
+    return content.getvalue()
 
 
-class GapWarning(schema.DataWarning):
-    """A few frames that a sensor lacks, or jumps in time: sequences are cut there, and the rest is whole."""
+def to_toml(values: Mapping, tables: Mapping[str, Mapping]) -> str:
+    """Formats top-level values and one level of tables; strings, booleans, numbers and nested lists of them."""
+    lines = [f"{name} = {_toml_value(value)}" for name, value in values.items()]
+    for table, entries in tables.items():
+        lines += ["", f"[{table}]"] + [f"{name} = {_toml_value(value)}" for name, value in entries.items()]
+    return "\n".join(lines) + "\n"
 
 
-def warn_of_gaps(where: str, present: np.ndarray, absent: dict[str, int], late: np.ndarray, pieces: int) -> None:
-    """Warns, with counts, of frames that a sensor lacks and of gaps in time; says nothing where there are none.
-
-    Args:
-      where: the run.
-      present: bool [F].
-      absent: sensor -> number of frames it lacks.
-      late: bool [F], see after_gap.
-      pieces: into how many sequences the run falls.
-    """
-    found = []
-    if not present.all():
-        lacking = ", ".join(f"{count} in {sensor}" for sensor, count in absent.items() if count)
-        found.append(f"{int((~present).sum())} of {len(present)} frames are left out because a file is missing "
-                     f"({lacking})")
-    if late.any():
-        found.append(f"time jumps by more than {GAP_PERIODS} periods at {int(late.sum())} of {len(present)} frames")
-    if found:
-        few = max(int((~present).sum()), int(late.sum())) <= max(1, FEW_SHARE * len(present))
-        left = words.counted(pieces, "gap-free sequence")
-        warnings.warn(f"{where}: {' and '.join(found)}; what is left makes {left}.",
-                      GapWarning if few else schema.DataWarning, stacklevel=4)
+def _toml_value(value) -> str:
+    if isinstance(value, (list, tuple)):
+        return "[" + ", ".join(_toml_value(item) for item in value) + "]"
+    if isinstance(value, str):
+        return json.dumps(value, ensure_ascii=False)
+    if isinstance(value, (bool, np.bool_)):
+        return "true" if value else "false"
+    if isinstance(value, (float, np.floating)):
+        return repr(float(value))
+    return str(int(value))

@@ -17,7 +17,7 @@ import numpy as np
 
 from muvo_jax import config as config_lib
 from muvo_jax import types
-from muvo_jax.data import ego_motion, prepare, schema
+from muvo_jax.data import ego_motion, prepare, schema, sequences
 from muvo_jax.data import windows as windows_lib
 
 State = dict[str, Any]  # plain JSON types
@@ -35,13 +35,13 @@ class Frames:
     """
 
     def __init__(self, recording: schema.Recording, config: config_lib.Config):
-        """`config` must be adapted to the recording (prepare.adapt)."""
+        """`config` must be adapted to the recording (fitting.adapt)."""
         self.recording = recording
         self.config = config
         self.cache = windows_lib.FrameCache(int(config.data.cache_gib * 2**30))
         self._actions = windows_lib.StepActions(recording)
         self.needs = prepare.needed(config, recording.description.modalities)
-        self._not_in_all = recording.description.modalities - schema.in_every_frame(recording) - self.needs
+        self._not_in_all = recording.description.modalities - sequences.in_every_frame(recording) - self.needs
 
     def get(self, sequence: schema.Sequence, index: int) -> prepare.PreparedFrame:
         """Frame `index` of `sequence`; called from several threads at once."""

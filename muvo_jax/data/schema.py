@@ -1,7 +1,7 @@
 """What a recording is, whatever its format: a description, gap-free sequences and raw frames.
 
-A reader (plain.py, kitti.py) turns a folder into a `Recording`; prepare.py turns raw frames into what the model eats;
-pipeline.py cuts windows. Ego frame and time convention: muvo_jax.types.
+A reader (plain/reader.py and its like) turns a folder into a `Recording`; prepare.py turns raw frames into what the
+model eats; pipeline.py cuts windows. Ego frame and time convention: muvo_jax.types.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from muvo_jax.limits import RangeError, between, check
 from muvo_jax.ops import camera as camera_ops
 
 __all__ = ["INSTANCE_CLASSES", "LABELS", "Camera", "DataError", "DataWarning", "RawFrame", "Recording",
-           "RecordingDescription", "Sequence", "in_every_frame", "instance_mask", "longest"]
+           "RecordingDescription", "Sequence", "instance_mask"]
 
 _SIDE_PX = between(1, 100_000, "px")
 _RIGID = 0.02  # calibrations are printed with a few digits
@@ -229,14 +229,3 @@ class Recording(Protocol):
 def instance_mask(classes: np.ndarray, names: tuple[str, ...]) -> np.ndarray:
     """bool [...], where `classes`, indices into `names`, show INSTANCE_CLASSES."""
     return np.isin(classes, [index for index, name in enumerate(names) if name in INSTANCE_CLASSES])
-
-
-def longest(sequences: tuple[Sequence, ...], split: str, needed: Collection[str] = ()) -> int:
-    """Frames in the longest sequence of a split that has the needed fields, 0 where there is none."""
-    return max((sequence.length for sequence in sequences if sequence.split == split and sequence.has(needed)),
-               default=0)
-
-
-def in_every_frame(recording: Recording) -> frozenset[str]:
-    """The keys of RawFrame that no sequence lacks."""
-    return recording.description.modalities.difference(*(sequence.lacks for sequence in recording.sequences))

@@ -6,9 +6,13 @@ import pathlib
 from collections.abc import Callable, Collection
 from typing import Any, NamedTuple
 
-from muvo_jax import config as config_lib
-from muvo_jax.data import carla, carla_runs, files, kitti, manifest, plain, prepare, records, schema
-from muvo_jax.data.town import record
+from muvo_jax.data import files, schema
+from muvo_jax.data.kitti import reader as kitti_reader
+from muvo_jax.data.muvo import reader as muvo_reader
+from muvo_jax.data.muvo import runs as muvo_runs
+from muvo_jax.data.packed import manifest
+from muvo_jax.data.packed import reader as packed_reader
+from muvo_jax.data.plain import reader as plain_reader
 
 
 class Kind(NamedTuple):
@@ -33,14 +37,15 @@ class Kind(NamedTuple):
 
 KINDS = (
     Kind("packed", f"a folder of shards with {manifest.MANIFEST_FILE}",
-         lambda path: (path / manifest.MANIFEST_FILE).is_file(), records.PackedRecording,
+         lambda path: (path / manifest.MANIFEST_FILE).is_file(), packed_reader.PackedRecording,
          options=("labels", "corrupt")),
-    Kind("plain", f"a folder with {plain.DESCRIPTION_FILE}",
-         lambda path: (path / plain.DESCRIPTION_FILE).is_file(), plain.PlainRecording),
+    Kind("plain", f"a folder with {plain_reader.DESCRIPTION_FILE}",
+         lambda path: (path / plain_reader.DESCRIPTION_FILE).is_file(), plain_reader.PlainRecording),
     Kind("KITTI raw", "<date>/<date>_drive_NNNN_sync folders, or one of them",
-         lambda path: bool(kitti.find_drives(path)), kitti.KittiRecording, kitti.CAMERAS, options=("camera",)),
-    Kind("MUVO CARLA", f"trainval/<mode>/<Town>/<run> folders with {carla_runs.FRAME_FILE}, or one of them",
-         lambda path: bool(carla_runs.folders(path)), carla.CarlaRecording),
+         lambda path: bool(kitti_reader.find_drives(path)), kitti_reader.KittiRecording, kitti_reader.CAMERAS,
+         options=("camera",)),
+    Kind("MUVO CARLA", f"trainval/<mode>/<Town>/<run> folders with {muvo_runs.FRAME_FILE}, or one of them",
+         lambda path: bool(muvo_runs.folders(path)), muvo_reader.MuvoRecording),
 )
 
 
@@ -86,7 +91,7 @@ def open_recording(path: pathlib.Path | str, *, camera: str = "", skip_corrupt_s
 
     Args:
       camera: which one, where the format records several; by default the reader's choice.
-      skip_corrupt_shards: of a packed recording; see records.PackedRecording.
+      skip_corrupt_shards: of a packed recording; see packed_reader.PackedRecording.
       labels: which of schema.LABELS the frames should have, where the recording holds them.
 
     Raises:
@@ -97,18 +102,3 @@ def open_recording(path: pathlib.Path | str, *, camera: str = "", skip_corrupt_s
     given: dict[str, Any] = {"labels": frozenset(labels), "corrupt": "skip" if skip_corrupt_shards else "raise"}
     given |= {"camera": camera} if camera else {}
     return kind.open(path, **{name: value for name, value in given.items() if name in kind.options})
-
-
-def open_configured(config: config_lib.Config, progress: record.Progress | None = None) -> schema.Recording:
-    """Opens the recording that a config names; the built-in town is recorded first where it is not in the cache.
-
-    Args:
-      progress: called with (frames done, frames in all) while the town is recorded.
-
-    Raises:
-      DataError: as open_recording.
-    """
-    if config.data.path == "town":
-        return open_recording(record.cached_town(config, progress), labels=prepare.labels(config))
-    return open_recording(config.data.path, camera=config.data.camera, labels=prepare.labels(config),
-                          skip_corrupt_shards=config.data.skip_corrupt_shards)

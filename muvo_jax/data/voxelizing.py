@@ -26,19 +26,12 @@ from typing import NamedTuple
 import numpy as np
 
 from muvo_jax import config as config_lib
-from muvo_jax.data import (
-    carla,
-    carla_files,
-    carla_runs,
-    description,
-    files,
-    frame_pickle,
-    plain,
-    processes,
-    recorder,
-    safe_pickle,
-    schema,
-)
+from muvo_jax.data import description, files, processes, schema
+from muvo_jax.data.muvo import files as muvo_files
+from muvo_jax.data.muvo import frame_pickle, safe_pickle
+from muvo_jax.data.muvo import reader as muvo_reader
+from muvo_jax.data.muvo import runs as muvo_runs
+from muvo_jax.data.plain import reader as plain_reader
 from muvo_jax.ops import camera as camera_ops
 from muvo_jax.ops import voxels as voxel_ops
 
@@ -105,7 +98,7 @@ def voxelize(path: pathlib.Path | str, *, rule: str = "carved", overwrite: bool 
         missing = [frame for frame in frames if not is_whole(frame.target)]
         for folder in {frame.target.parent for frame in missing}:
             folder.mkdir(exist_ok=True)
-            recorder.write_atomically(folder / RULE_FILE, rule_text)
+            files.write_atomically(folder / RULE_FILE, rule_text)
         kept = len(frames) - len(missing)
         chunks = [missing[first:first + _CHUNK] for first in range(0, len(missing), _CHUNK)]
         workers = min(workers or processes.processors(), len(chunks))
@@ -133,7 +126,7 @@ def make_frames(rig: Rig, frames: list[Frame]) -> list[str]:
     outcomes = []
     for frame in frames:
         try:
-            recorder.write_atomically(frame.target, _content(rig, frame))
+            files.write_atomically(frame.target, _content(rig, frame))
         except schema.DataError as error:
             outcomes.append(str(error))
         else:
@@ -190,14 +183,14 @@ def carved_occupancy(depth_m: np.ndarray, points_m: np.ndarray, intrinsics: np.n
 
 def _survey(path: pathlib.Path, rule: str) -> tuple[Rig, dict[pathlib.Path, list[Frame]]]:
     """What is measured with, and the frames of every run by its folder; checks that there is depth and lidar."""
-    if (path / plain.DESCRIPTION_FILE).is_file():
+    if (path / plain_reader.DESCRIPTION_FILE).is_file():
         rig, runs = _survey_plain(path, rule)
-    elif path.is_dir() and carla_runs.folders(path):
+    elif path.is_dir() and muvo_runs.folders(path):
         rig, runs = _survey_muvo(path, rule)
     else:
         raise schema.DataError(f"{path} is no recording whose occupancy can be made; expected a plain one (a folder "
-                               f"with {plain.DESCRIPTION_FILE}) or runs of the MUVO layout (with "
-                               f"{carla_runs.FRAME_FILE}).")
+                               f"with {plain_reader.DESCRIPTION_FILE}) or runs of the MUVO layout (with "
+                               f"{muvo_runs.FRAME_FILE}).")
     for folder, frames in runs.items():
         for what, places in (("depth map", {frame.depth for frame in frames}),
                              ("lidar scan", {frame.points for frame in frames})):
@@ -209,15 +202,15 @@ def _survey(path: pathlib.Path, rule: str) -> tuple[Rig, dict[pathlib.Path, list
 
 
 def _survey_plain(path: pathlib.Path, rule: str) -> tuple[Rig, dict[pathlib.Path, list[Frame]]]:
-    toml_path = path / plain.DESCRIPTION_FILE
-    header = plain.read_header(path)
+    toml_path = path / plain_reader.DESCRIPTION_FILE
+    header = plain_reader.read_header(path)
     if "voxels" not in header:
         raise schema.DataError(f"{toml_path}: no section [voxels], the grid to fill; add one, such as [voxels] shape = "
                                f"[192, 192, 64], voxel_size_m = 0.5, origin_m = [-48.0, -48.0, -6.0].")
     camera, lidar, grid = (description.section(header, name, toml_path, required=True)
                            for name in ("camera", "lidar", "voxels"))
     runs = {}
-    for run in plain.read_runs(path, tuple(description.field(header, "splits", list, toml_path))):
+    for run in plain_reader.read_runs(path, tuple(description.field(header, "splits", list, toml_path))):
         names = [f"{int(number):06d}" for number in run.columns["frame_id"]]
         runs[run.folder] = [Frame(run.folder / "depth" / f"{name}.png", run.folder / "lidar" / f"{name}.npz",
                                   run.folder / "occupancy" / f"{name}.npz") for name in names]
@@ -225,20 +218,20 @@ def _survey_plain(path: pathlib.Path, rule: str) -> tuple[Rig, dict[pathlib.Path
 
 
 def _survey_muvo(path: pathlib.Path, rule: str) -> tuple[Rig, dict[pathlib.Path, list[Frame]]]:
-    toml_path = path / carla.SENSORS_FILE
+    toml_path = path / muvo_reader.SENSORS_FILE
     header = files.read_toml(toml_path) if toml_path.is_file() else {}
     camera, lidar, grid = (description.section(header, name, toml_path, required=False)
                            for name in ("camera", "lidar", "voxels"))
     runs = {}
-    for run in carla_runs.find_runs(path):
+    for run in muvo_runs.find_runs(path):
         lacking = [kind for kind in ("depth_semantic", "points_semantic") if f"{kind}_path" not in run.columns]
         if lacking:
-            raise schema.DataError(f"{run.folder / carla_runs.FRAME_FILE}: no column {lacking[0]}_path; occupancy is "
+            raise schema.DataError(f"{run.folder / muvo_runs.FRAME_FILE}: no column {lacking[0]}_path; occupancy is "
                                    f"made from depth and lidar. Record both.")
-        name = carla.occupancy_name if rule == "carved" else lambda row: carla_files.file_name("voxel", row)
+        name = muvo_reader.occupancy_name if rule == "carved" else lambda row: muvo_files.file_name("voxel", row)
         runs[run.folder] = [Frame(run.path("depth_semantic", row), run.path("points_semantic", row),
                                   run.folder / name(row)) for row in range(run.frames)]
-    return Rig(True, rule, camera, (lidar or carla.LIDAR).position_m, grid or carla.VOXELS), runs
+    return Rig(True, rule, camera, (lidar or muvo_reader.LIDAR).position_m, grid or muvo_reader.VOXELS), runs
 
 
 def _clear(folder: pathlib.Path, rule_text: str, overwrite: bool) -> None:
@@ -257,16 +250,16 @@ def _clear(folder: pathlib.Path, rule_text: str, overwrite: bool) -> None:
 def _content(rig: Rig, frame: Frame) -> bytes:
     """The bytes of the frame's new file."""
     if rig.is_muvo:
-        depth, tags = carla_files.read_depth_semantic(frame.depth)
-        scan = carla_files.read_points(frame.points, rig.lidar_position_m)
+        depth, tags = muvo_files.read_depth_semantic(frame.depth)
+        scan = muvo_files.read_points(frame.points, rig.lidar_position_m)
         if rig.rule == "reference":
             file = io.BytesIO()
-            np.save(file, _reference_table(rig, frame, depth * carla_files.DEPTH_RANGE_M, tags, scan))
+            np.save(file, _reference_table(rig, frame, depth * muvo_files.DEPTH_RANGE_M, tags, scan))
             return file.getvalue()
         keep: Callable[[np.ndarray], np.ndarray] = _without_own_car
-        depth_m, points_m = np.where(depth < 1.0, depth * carla_files.DEPTH_RANGE_M, np.inf), scan.points_m
+        depth_m, points_m = np.where(depth < 1.0, depth * muvo_files.DEPTH_RANGE_M, np.inf), scan.points_m
     else:
-        depth_m = plain.decode_depth(files.read_image(frame.depth, None))
+        depth_m = plain_reader.decode_depth(files.read_image(frame.depth, None))
         points_m = files.read_npz(frame.points, "points_m").astype(np.float32)
         if depth_m.ndim != 2 or points_m.shape[1:] != (3,):
             raise schema.DataError(f"{frame.depth}, {frame.points}: depth of shape {list(depth_m.shape)}, points of "
@@ -280,28 +273,28 @@ def _content(rig: Rig, frame: Frame) -> bytes:
     else:
         occupancy = carved_occupancy(depth_m, points_m, intrinsics, camera_to_ego, rig.lidar_position_m, rig.grid,
                                      keep=keep)
-    return recorder.npz_bytes({"occupancy": occupancy})
+    return files.npz_bytes({"occupancy": occupancy})
 
 
 def _reference_table(rig: Rig, frame: Frame, depth_m: np.ndarray, tags: np.ndarray,
-                     scan: carla_files.Points) -> np.ndarray:
+                     scan: muvo_files.Points) -> np.ndarray:
     if scan.tags is None:
         raise schema.DataError(f"{frame.points}: no ObjTag, what each point hit; the reference rule labels with it. "
                                f"Use the rule {RULES[0]}.")
-    fov_rad, position_m = carla.FOV_RAD, carla.MOUNT_M
+    fov_rad, position_m = muvo_reader.FOV_RAD, muvo_reader.MOUNT_M
     if rig.camera is not None:
         intrinsics, camera_to_ego = _pinhole(rig.camera, depth_m.shape, frame.depth)
         centre_px = (depth_m.shape[1] / 2, depth_m.shape[0] / 2)
         if not (np.allclose(camera_to_ego[:3, :3], _LEVEL) and np.allclose(intrinsics[:2, 2], centre_px)):
-            raise schema.DataError(f"{carla.SENSORS_FILE}: the reference rule knows only level cameras with a centred "
-                                   f"principal point. Use the rule {RULES[0]}.")
+            raise schema.DataError(f"{muvo_reader.SENSORS_FILE}: the reference rule knows only level cameras with a "
+                                   f"centred principal point. Use the rule {RULES[0]}.")
         fov_rad = 2.0 * math.atan(0.5 * depth_m.shape[1] / float(intrinsics[0, 0]))
         x_m, y_m, z_m = map(float, camera_to_ego[:3, 3])
         position_m = (x_m, y_m, z_m)
     seen_m, pixel = camera_ops.reference_depth_points(depth_m, fov_rad, position_m)
     points_m, hit = np.concatenate([seen_m, scan.points_m]), np.concatenate([tags.reshape(-1)[pixel], scan.tags])
-    kept = ~carla_files.in_ego_box(points_m)
-    return voxel_ops.voxel_table(points_m[kept], hit[kept], rig.grid, winning_tag=carla_files.ROAD_LINE)
+    kept = ~muvo_files.in_ego_box(points_m)
+    return voxel_ops.voxel_table(points_m[kept], hit[kept], rig.grid, winning_tag=muvo_files.ROAD_LINE)
 
 
 def _all(points_m: np.ndarray) -> np.ndarray:
@@ -309,15 +302,15 @@ def _all(points_m: np.ndarray) -> np.ndarray:
 
 
 def _without_own_car(points_m: np.ndarray) -> np.ndarray:
-    return points_m[~carla_files.in_ego_box(points_m)]
+    return points_m[~muvo_files.in_ego_box(points_m)]
 
 
 def _pinhole(camera: schema.Camera | None, shape: tuple[int, ...],
              path: pathlib.Path) -> tuple[np.ndarray, np.ndarray]:
     height_px, width_px = shape
     if camera is None:
-        return (camera_ops.intrinsics_from_fov(width_px, height_px, carla.FOV_RAD),
-                camera_ops.level_camera_to_ego(carla.MOUNT_M))
+        return (camera_ops.intrinsics_from_fov(width_px, height_px, muvo_reader.FOV_RAD),
+                camera_ops.level_camera_to_ego(muvo_reader.MOUNT_M))
     if (camera.width_px, camera.height_px) != (width_px, height_px):
         raise schema.DataError(f"{path}: {width_px}x{height_px} pixels, but the camera is described with "
                                f"{camera.width_px}x{camera.height_px}; depth must be that of the image.")
@@ -326,11 +319,11 @@ def _pinhole(camera: schema.Camera | None, shape: tuple[int, ...],
 
 def _add_column(folder: pathlib.Path, frames: list[Frame]) -> None:
     """Tells the data frame where the voxels are, as the authors' tool does; the original is kept beside it."""
-    path = folder / carla_runs.FRAME_FILE
+    path = folder / muvo_runs.FRAME_FILE
     columns = safe_pickle.load_table(path)
     if "voxel_path" in columns:
         return
     names = [frame.target.relative_to(folder).as_posix() for frame in frames]
     if not (folder / ORIGINAL_FRAME_FILE).exists():
         shutil.copyfile(path, folder / ORIGINAL_FRAME_FILE)
-    recorder.write_atomically(path, frame_pickle.frame(dict(columns) | {"voxel_path": names}))
+    files.write_atomically(path, frame_pickle.frame(dict(columns) | {"voxel_path": names}))

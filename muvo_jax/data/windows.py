@@ -9,7 +9,7 @@ from collections.abc import Callable, Collection, Hashable
 
 import numpy as np
 
-from muvo_jax.data import prepare, schema
+from muvo_jax.data import prepare, schema, sequences
 
 
 @dataclasses.dataclass(frozen=True)
@@ -24,7 +24,12 @@ class Window:
     @property
     def indices(self) -> range:
         """Indices of the frames within the sequence."""
-        return range(self.start, self.start + prepare.span(self.frames, self.stride), self.stride)
+        return range(self.start, self.start + span(self.frames, self.stride), self.stride)
+
+
+def span(frames: int, stride: int) -> int:
+    """Recorded frames from the first to the last of a window."""
+    return (frames - 1) * stride + 1
 
 
 def find_windows(recording: schema.Recording, split: str, *, frames: int, stride: int,
@@ -39,10 +44,27 @@ def find_windows(recording: schema.Recording, split: str, *, frames: int, stride
                                f"{', '.join(recording.description.splits)}.")
     found = tuple(Window(sequence, start, frames, stride) for sequence in recording.sequences
                   if sequence.split == split and sequence.has(needs)
-                  for start in range(sequence.length - prepare.span(frames, stride) + 1))
+                  for start in range(sequence.length - span(frames, stride) + 1))
     if not found:
-        raise prepare.too_short(recording, split, frames, stride, needs)
+        raise too_short(recording, split, frames, stride, needs)
     return found
+
+
+def too_short(recording: schema.Recording, split: str, frames: int, stride: int,
+              needs: Collection[str] = ()) -> schema.DataError:
+    """The error for a split without a single window of frames that have what is needed; names both lengths."""
+    found = sequences.longest(recording.sequences, split, needs)
+    every = sequences.longest(recording.sequences, split)
+    start = f"recording {recording.description.name!r}: the longest gap-free sequence of split {split!r}"
+    if every >= span(frames, stride) > found:
+        lacking = sorted({name for sequence in recording.sequences if sequence.split == split
+                          for name in sequence.lacks if name in needs})
+        return schema.DataError(f"{start} that has {', '.join(lacking)} has {found} frames, but a window needs "
+                                f"{span(frames, stride)}. Record these for that split too, or train a model that does "
+                                f"not need them.")
+    return schema.DataError(f"{start} has {found} frames, but a window of {frames} frames at stride {stride} needs "
+                            f"{span(frames, stride)}. Choose fewer frames (data.frames, data.context, data.horizon) or "
+                            f"a smaller data.stride, or record longer runs.")
 
 
 def spread(windows: tuple[Window, ...], count: int) -> tuple[Window, ...]:

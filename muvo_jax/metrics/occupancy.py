@@ -7,6 +7,7 @@ it. So IoU+ above the road is the headline.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 
 import numpy as np
@@ -34,7 +35,7 @@ def counts(occupied: np.ndarray, target: np.ndarray, *, unknown_is_empty: bool,
     """Counts of voxels, int64 [B, H], that `score` reads.
 
     Args:
-      occupied: bool [B, H, X, Y, Z], predicted probability above 0.5 (`predicted_occupied`).
+      occupied: bool [B, H, X, Y, Z], `predicted_occupied`.
       target: uint8 [B, H, X, Y, Z], 0 empty, 1 occupied, 255 unknown.
       unknown_is_empty: whether unknown voxels count as empty; otherwise they do not count.
       where: bool [B, H, X, Y, Z], which voxels count at all; None for all.
@@ -63,6 +64,6 @@ SCORES: dict[str, Callable[[streaming.Sums], np.ndarray]] = {
 }
 
 
-def predicted_occupied(logits: types.Array) -> types.Array:
-    """bool [...] from logits [..., 2]: probability of "occupied" above 0.5."""
-    return logits[..., 1] > logits[..., 0]
+def predicted_occupied(logits: types.Array, above: float) -> types.Array:
+    """bool [...] from logits [..., 2]: probability of "occupied" above ModelConfig.occupied_above."""
+    return logits[..., 1] - logits[..., 0] > math.log(above / (1.0 - above))

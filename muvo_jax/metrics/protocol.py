@@ -49,8 +49,9 @@ def identity(config: config_lib.Config) -> str:
     frame_s = data.stride / config.contract.rate_hz
     latents = "sampled" if evaluation.sampled else "mean"
     return (f"{VERSION}: context {data.context}, horizon {data.horizon}, {frame_s:g} s a step, Chamfer on "
-            f"{evaluation.chamfer_points or 'all'} points, return above {evaluation.return_threshold_m:g} m, {latents} "
-            f"latents, {_MOTION[config.contract.kinematics]}, seed {evaluation.seed}")
+            f"{evaluation.chamfer_points or 'all'} points, return above {evaluation.return_threshold_m:g} m, "
+            f"occupied above {config.model.occupied_above:g}, {latents} latents, "
+            f"{_MOTION[config.contract.kinematics]}, seed {evaluation.seed}")
 
 
 def predict(model: world_model.WorldModel, variables: types.Variables, key: types.Array, batch: types.Batch, *,
@@ -83,7 +84,7 @@ def _predict(model, variables, key, batch, other_action, context, horizon, sampl
     states = jax.tree.map(lambda seen, dreamt: jnp.concatenate([seen, *jnp.unstack(dreamt, axis=1)], axis=1),
                           observed.states, dream.states)
     heads = shown_heads(model.config)
-    frames = finish(model.decode(variables, states, heads, observed.memory))
+    frames = finish(model.decode(variables, states, heads, observed.memory), model.config)
     end = context + horizon
     return ({name: value[:, :end] for name, value in frames.items()},
             None if other_action is None else {name: value[:, end:] for name, value in frames.items()})
@@ -94,8 +95,8 @@ def shown_heads(config: config_lib.ModelConfig) -> tuple[str, ...]:
     return tuple(head for head in (*HEADS, *maps.FIELDS) if head in config.heads)
 
 
-def finish(predictions: types.Predictions) -> dict[str, types.Array]:
-    """Full-scale predictions as frames: the image clipped to [0, 1], occupancy decided at probability 0.5.
+def finish(predictions: types.Predictions, model: config_lib.ModelConfig) -> dict[str, types.Array]:
+    """Full-scale predictions as frames: the image clipped to [0, 1], occupancy decided as the model says.
 
     What optional heads draw stands under the names of types.Batch (maps.finish).
     """
@@ -104,7 +105,7 @@ def finish(predictions: types.Predictions) -> dict[str, types.Array]:
     if "image" in frames:
         frames["image"] = jax.numpy.clip(frames["image"], 0.0, 1.0)
     if "occupancy" in frames:
-        frames["occupancy"] = occupancy.predicted_occupied(frames["occupancy"])
+        frames["occupancy"] = occupancy.predicted_occupied(frames["occupancy"], model.occupied_above)
     return frames
 
 

@@ -194,7 +194,7 @@ class Part:
       compose: what is drawn, put upon what the memory shows and upon the average frame.
       blurs: whether what is seen reaches what is drawn by a linear path too. What is uncertain of an image is best
         blurred, a linear function, and learned soonest as one. (Ranges are not: such a path moved every return a
-        little, and Chamfer from 0.65 m to 0.73 m.)
+        little.)
     """
 
     plane: Callable[[ModelConfig], tuple[int, int]]

@@ -19,7 +19,7 @@ import jax
 
 from muvo_jax import config as config_lib
 from muvo_jax import types
-from muvo_jax.data import pipeline, prepare, schema, words
+from muvo_jax.data import fitting, pipeline, schema, sequences, words
 from muvo_jax.objectives import perceptual
 from muvo_jax.training import checkpoint, checkpoint_meta, host, preparation, run_folder, screen, start, validation
 
@@ -91,7 +91,7 @@ def train(job: Job, show: screen.Screen) -> Outcome:
         frames = pipeline.Frames(recording, config)
         source = pipeline.train_batches(frames, seed=config.train.seed, batch=windows_per_step(config))
         shapes = preparation.expected_batch(config, windows_per_step(config),
-                                            recorded=schema.in_every_frame(recording))
+                                            recorded=sequences.in_every_frame(recording))
         ready = early.result()
         ready = (preparation.recompile(ready, config, shapes, job.frozen) if ready
                  else preparation.prepare(config, shapes, job.frozen))
@@ -143,8 +143,8 @@ def _prepare_early(config: config_lib.Config,
 def _open_data(job: Job, show: screen.Screen) -> tuple[config_lib.Config, schema.Recording, float]:
     start_s = time.perf_counter()
     recording = job.open_recording()
-    adapted = prepare.adapt(job.config, recording, keep=job.chosen)
-    prepare.check_targets(adapted.config, recording.description)
+    adapted = fitting.adapt(job.config, recording, keep=job.chosen)
+    fitting.check_targets(adapted.config, recording.description)
     description = recording.description
     counts = provenance(recording, adapted.config)["frames"]
     show.field("data", f"{description.name} ({description.kind}, {description.rate_hz:g} Hz), frames: "

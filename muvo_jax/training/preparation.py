@@ -63,8 +63,8 @@ def expected_batch(config: config_lib.Config, windows: int, *,
 
     Args:
       config: adapted to the data, or a preset of the built-in town.
-      recorded: what every frame of the recording has (schema.in_every_frame); by default what the built-in town has of
-        those that every batch brings along, whatever the model reads.
+      recorded: what every frame of the recording has (sequences.in_every_frame); by default what the built-in town has
+        of those that every batch brings along, whatever the model reads.
     """
     model, prefix = config.model, (windows, config.data.frames)
 

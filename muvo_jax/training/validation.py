@@ -10,9 +10,9 @@ import jax
 import numpy as np
 
 from muvo_jax import config as config_lib
+from muvo_jax import recordings, types
 from muvo_jax import run as run_lib
-from muvo_jax import types
-from muvo_jax.data import pipeline, prepare, schema, sources
+from muvo_jax.data import fitting, pipeline, schema
 from muvo_jax.metrics import baselines, protocol, skill
 from muvo_jax.model import world_model
 from muvo_jax.objectives import perceptual
@@ -89,10 +89,10 @@ def windows_of_run(run: run_lib.Run | str | os.PathLike, split: str | None = Non
                    frames: int | None = None) -> types.Batch:
     """See muvo_jax.windows."""
     config = (run if isinstance(run, run_lib.Run) else checkpoint.load_run(run)).config
-    recording = sources.open_configured(config)
+    recording = recordings.open_configured(config)
     held_out = [name for name in recording.description.splits if name != "train"]
     split = split or (held_out or ["train"])[0]
-    entry = next(pipeline.evaluation_batches(pipeline.Frames(recording, prepare.adapt(config, recording).config), split,
+    entry = next(pipeline.evaluation_batches(pipeline.Frames(recording, fitting.adapt(config, recording).config), split,
                                              windows=count, length=frames, batch=count))
     if entry.count < count:
         raise schema.DataError(f"split {split!r} of {recording.description.name!r} has {entry.count} windows of "

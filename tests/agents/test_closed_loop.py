@@ -7,9 +7,9 @@ import worlds
 
 from muvo_jax import command_line, plan_drive, presets
 from muvo_jax.agents import closed_loop, planners, sensitivity
-from muvo_jax.data.town import settings
-from muvo_jax.data.town import simulator as town_lib
 from muvo_jax.model import world_model
+from muvo_jax.town import settings
+from muvo_jax.town import simulator as town_lib
 
 STEP_S = 0.2
 FAST = planners.PlannerConfig(plans=8, iterations=2, elites=2, kept=1)

@@ -9,8 +9,8 @@ import pytest
 
 from muvo_jax import config as config_lib
 from muvo_jax.agents import rewards
-from muvo_jax.data.town import renderer, simulator
 from muvo_jax.ops import motion as motion_ops
+from muvo_jax.town import renderer, simulator
 
 CONTRACT = config_lib.ActionContract()
 GRID = config_lib.VoxelGrid((16, 16, 4), 1.0, (-8.0, -8.0, -1.5))

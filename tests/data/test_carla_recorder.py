@@ -11,17 +11,14 @@ import numpy as np
 import pytest
 
 from muvo_jax import command_line, record_carla
-from muvo_jax.data import (
-    carla_client,
-    carla_drives,
-    carla_files,
-    carla_frames,
-    carla_recorder,
-    plain,
-    processes,
-    recorder,
-    voxelizing,
-)
+from muvo_jax.data import processes, voxelizing
+from muvo_jax.data.carla import client as carla_client
+from muvo_jax.data.carla import drives as carla_drives
+from muvo_jax.data.carla import frames as carla_frames
+from muvo_jax.data.carla import recorder as carla_recorder
+from muvo_jax.data.muvo import files as muvo_files
+from muvo_jax.data.plain import reader as plain_reader
+from muvo_jax.data.plain import writer as plain_writer
 
 SETTINGS = carla_drives.Settings(width_px=24, height_px=16, points_per_frame=50)
 JOB = carla_drives.CarlaDrive("train", "Town01_000", "Town01", "ClearNoon", 3, 14)
@@ -82,13 +79,13 @@ def test_a_drive_is_a_plain_recording_in_the_ego_frame(tmp_path):
     simulator = FakeSimulator()
     carla_recorder.record(tmp_path, simulator, [JOB], SETTINGS)
     assert not simulator.running
-    recording = plain.PlainRecording(tmp_path)
+    recording = plain_reader.PlainRecording(tmp_path)
     assert recording.sequences[0].length == JOB.frames
     frame = recording.read(recording.sequences[0], 3)
     # y right becomes y left, the mount is added, and what hit the own car is gone.
     np.testing.assert_allclose(frame["points_m"], [[14, -4, 0], [21, 3, 3]], atol=1e-6)
     with np.load(tmp_path / "train/Town01_000/lidar/000003.npz") as arrays:
-        assert arrays["point_tags"].tolist() == [carla_files.ROAD_LINE, carla_files.VEHICLE]
+        assert arrays["point_tags"].tolist() == [muvo_files.ROAD_LINE, muvo_files.VEHICLE]
     np.testing.assert_allclose(frame["action"], [0.5, 0.04])  # of the tick after: it led there
     assert frame["speed_mps"] == 5 and frame["yaw_rate_radps"] == 0
     pixels = np.frombuffer(FakeSimulator.observe(types.SimpleNamespace(
@@ -101,7 +98,7 @@ def test_a_drive_is_a_plain_recording_in_the_ego_frame(tmp_path):
 def test_a_collision_is_the_end_of_a_sequence_and_costs(tmp_path):
     carla_recorder.record(tmp_path, FakeSimulator(lambda seen: seen._replace(collided=seen.frame == 104)), [JOB],
                           SETTINGS)
-    recording = plain.PlainRecording(tmp_path)
+    recording = plain_reader.PlainRecording(tmp_path)
     assert [sequence.length for sequence in recording.sequences] == [5, 9]
     frames = [recording.read(recording.sequences[0], index) for index in (3, 4)]
     assert [(frame["reward"], bool(frame["is_terminal"])) for frame in frames] == [(1.0, False), (-1.0, True)]
@@ -116,10 +113,10 @@ def test_a_collision_is_the_end_of_a_sequence_and_costs(tmp_path):
 
 def test_a_recording_can_be_voxelized_and_until_then_has_no_occupancy(tmp_path):
     carla_recorder.record(tmp_path, FakeSimulator(), [JOB._replace(frames=2)], SETTINGS)
-    described = plain.PlainRecording(tmp_path).description
+    described = plain_reader.PlainRecording(tmp_path).description
     assert described.voxels is None and "occupancy" not in described.modalities
     assert voxelizing.voxelize(tmp_path, workers=1).made == 2
-    recording = plain.PlainRecording(tmp_path)
+    recording = plain_reader.PlainRecording(tmp_path)
     frame = recording.read(recording.sequences[0], 0)
     assert frame["occupancy"].shape == recording.description.voxels.shape == (192, 192, 64)
     hit = frame["occupancy"][tuple(np.floor((frame["points_m"] - [-48, -48, -6]) / 0.5).astype(int).T)]
@@ -143,8 +140,8 @@ def test_depth_and_tags_come_from_the_clients_channels():
         **seen.measurements, "depth": camera(100, depth), "classes": camera(100, tags)})).start(JOB)
     frame = carla_frames.decode(seen, SETTINGS)
     np.testing.assert_allclose(frame["depth_m"][0, :3], np.array([1, 2 ** 24 - 1, 2 ** 20]) * 1000 / (2 ** 24 - 1))
-    assert recorder.encode_depth(frame["depth_m"])[0, 1] == recorder.DEPTH_SKY
-    assert frame["classes"][0, :2].tolist() == [carla_files.SKY, 7]
+    assert plain_writer.encode_depth(frame["depth_m"])[0, 1] == plain_writer.DEPTH_SKY
+    assert frame["classes"][0, :2].tolist() == [muvo_files.SKY, 7]
 
 
 def test_route_bends_to_the_left_in_the_picture_where_it_bends_to_the_left():
@@ -203,7 +200,7 @@ def test_sick_sensors_stop_the_recording_and_leave_the_run_incomplete(tmp_path, 
     with pytest.raises(carla_drives.CarlaError, match=message):
         carla_recorder.record(tmp_path, simulator, [JOB], SETTINGS)
     assert not simulator.running and len(simulator.started) == 1
-    assert not recorder.is_complete(tmp_path, JOB.split, JOB.run)
+    assert not plain_writer.is_complete(tmp_path, JOB.split, JOB.run)
 
 
 def test_a_bad_drive_is_tried_again_with_other_seeds(tmp_path, monkeypatch):
@@ -218,10 +215,10 @@ def test_a_bad_drive_is_tried_again_with_other_seeds(tmp_path, monkeypatch):
 
 
 def test_a_run_that_writes_nothing_is_an_error(tmp_path, monkeypatch):
-    monkeypatch.setattr(recorder.RunWriter, "write", lambda self, frame: None)
+    monkeypatch.setattr(plain_writer.RunWriter, "write", lambda self, frame: None)
     with pytest.raises(carla_drives.CarlaError, match=r"image: 0 files for 14 frames"):
         carla_recorder.record(tmp_path, FakeSimulator(), [JOB], SETTINGS)
-    assert not recorder.is_complete(tmp_path, JOB.split, JOB.run)
+    assert not plain_writer.is_complete(tmp_path, JOB.split, JOB.run)
 
 
 def test_a_disk_that_is_too_small_is_told_after_the_first_run(tmp_path, monkeypatch):
@@ -229,7 +226,7 @@ def test_a_disk_that_is_too_small_is_told_after_the_first_run(tmp_path, monkeypa
     jobs, simulator = [JOB, JOB._replace(run="Town01_001")], FakeSimulator()
     with pytest.raises(carla_drives.CarlaError, match=r"GB are needed, 0\.0 GB are free"):
         carla_recorder.record(tmp_path, simulator, jobs, SETTINGS)
-    assert len(simulator.started) == 1 and recorder.is_complete(tmp_path, JOB.split, JOB.run)
+    assert len(simulator.started) == 1 and plain_writer.is_complete(tmp_path, JOB.split, JOB.run)
 
 
 def test_collect_awaits_the_frame_of_every_sensor():
@@ -281,8 +278,8 @@ def test_tags_and_poses_agree_with_the_clients_types():
     tags = {name: int(value) for name, value in carla.CityObjectLabel.names.items() if name != "Any"}
     for name, expected in {"Roads": 7, "RoadLines": 6, "Sky": 13, "Car": 10, "Bus": 10, "Pedestrians": 4,
                            "Buildings": 1, "NONE": 0, "Terrain": 22, "TrafficLight": 18, "Water": 21}.items():
-        assert carla_files.LAYOUT_TAGS[tags[name]] == expected, name
-    assert all(carla_files.LAYOUT_TAGS[tag] for name, tag in tags.items() if name != "NONE")
+        assert muvo_files.LAYOUT_TAGS[tags[name]] == expected, name
+    assert all(muvo_files.LAYOUT_TAGS[tag] for name, tag in tags.items() if name != "NONE")
     placed = carla.Transform(carla.Location(3, 4, 0), carla.Rotation(yaw=90, pitch=10))
     assert carla_frames.pose_of(placed) == pytest.approx((3, -4, -math.pi / 2))
     forward = placed.get_forward_vector()

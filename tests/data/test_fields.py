@@ -11,7 +11,13 @@ from hypothesis.extra import numpy as arrays
 
 from muvo_jax import config as config_lib
 from muvo_jax import types
-from muvo_jax.data import fields, kitti, plain, recorder, records, schema, shards
+from muvo_jax.data import fields, schema
+from muvo_jax.data.kitti import reader as kitti_reader
+from muvo_jax.data.packed import reader as packed_reader
+from muvo_jax.data.packed import records
+from muvo_jax.data.packed import writer as packed_writer
+from muvo_jax.data.plain import reader as plain_reader
+from muvo_jax.data.plain import writer as plain_writer
 
 SIZES = {"H": 6, "W": 9, "N": 7, "X": 4, "Y": 5, "Z": 3}
 CLASSES = (*(f"class {number}" for number in range(20)), "vehicle")
@@ -50,7 +56,7 @@ def frames(draw):
         values = draw(arrays.arrays(field.dtype, shape, elements=numbers_of(field)))
         frame[field.name] = values if shape else field.dtype(values[()])
     if draw(st.booleans()):
-        frame["depth_m"] = plain.decode_depth(recorder.encode_depth(frame["depth_m"]))
+        frame["depth_m"] = plain_reader.decode_depth(plain_writer.encode_depth(frame["depth_m"]))
         frame["depth_m"][0, 0] = np.inf
     return frame
 
@@ -66,14 +72,14 @@ def copy(root, written, described=None):
     """The frames as a plain recording, opened."""
     camera, lidar, voxels = (CAMERA, LIDAR, GRID) if described is None else (described.camera, described.lidar,
                                                                             described.voxels)
-    recorder.write_description(root, name="copy", rate_hz=10.0, splits=("train",), camera=camera, lidar=lidar,
-                               voxels=voxels, classes=CLASSES,
-                               contract=config_lib.ActionContract() if described is None else described.contract)
-    writer = recorder.RunWriter(root, "train", "a")
+    plain_writer.write_description(root, name="copy", rate_hz=10.0, splits=("train",), camera=camera, lidar=lidar,
+                                   voxels=voxels, classes=CLASSES,
+                                   contract=config_lib.ActionContract() if described is None else described.contract)
+    writer = plain_writer.RunWriter(root, "train", "a")
     for frame in written:
         writer.write(frame)
     writer.close()
-    return plain.PlainRecording(root, labels=fields.LABELS)
+    return plain_reader.PlainRecording(root, labels=fields.LABELS)
 
 
 def test_raw_frames_and_batches_follow_the_table():
@@ -113,9 +119,9 @@ def test_a_run_may_have_one_of_the_masks_that_share_a_file(tmp_path):
 
 
 def test_kitti_and_packs_are_copied_bit_for_bit(tmp_path):
-    sources_ = {"kitti": kitti.KittiRecording(writers.write_kitti(tmp_path / "kitti"))}
-    shards.pack(writers.write_plain(tmp_path / "plain"), tmp_path / "packed", workers=1)
-    sources_["packed"] = records.PackedRecording(tmp_path / "packed")
+    sources_ = {"kitti": kitti_reader.KittiRecording(writers.write_kitti(tmp_path / "kitti"))}
+    packed_writer.pack(writers.write_plain(tmp_path / "plain"), tmp_path / "packed", workers=1)
+    sources_["packed"] = packed_reader.PackedRecording(tmp_path / "packed")
     for name, source in sources_.items():
         sequence = source.sequences[0]
         written = [source.read(sequence, index) for index in range(sequence.length)]

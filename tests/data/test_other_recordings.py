@@ -10,7 +10,10 @@ from PIL import Image
 
 from muvo_jax import config as config_lib
 from muvo_jax import presets
-from muvo_jax.data import fields, files, kitti, pipeline, plain, prepare, recorder, schema, sources, windows
+from muvo_jax.data import fields, files, fitting, pipeline, prepare, schema, sources, windows
+from muvo_jax.data.kitti import reader as kitti_reader
+from muvo_jax.data.plain import reader as plain_reader
+from muvo_jax.data.plain import writer as plain_writer
 
 
 def rewrite_table(folder, change):
@@ -43,9 +46,9 @@ def with_cell(column, row, value):
 ], ids=["byte order mark", "spaces", "Windows lines", "blank lines", "blank in header", "blank flag", "word", "12.0"])
 def test_tables_as_other_programs_write_them(tmp_path, change):
     root = writers.write_plain(tmp_path)
-    before = pieces(plain.PlainRecording(root))
+    before = pieces(plain_reader.PlainRecording(root))
     rewrite_table(root / "train/a", change)
-    assert pieces(plain.PlainRecording(root)) == before
+    assert pieces(plain_reader.PlainRecording(root)) == before
 
 
 @pytest.mark.parametrize(("change", "message"), [
@@ -67,7 +70,7 @@ def test_tables_that_cannot_be_are_refused_by_line_column_value_and_range(tmp_pa
     root = writers.write_plain(tmp_path)
     rewrite_table(root / "train/a", change)
     with pytest.raises(schema.DataError, match=f"frames.csv.*{message}"):
-        plain.PlainRecording(root)
+        plain_reader.PlainRecording(root)
 
 
 @pytest.mark.parametrize("first", [1_700_000_000_100_000_001, 2**53, 2**63 - 20])
@@ -78,7 +81,7 @@ def test_whole_numbers_stay_whole(tmp_path, first):
         for path in folder.glob(f"*/{number:06d}.*"):
             path.rename(path.with_name(f"{first + number}{path.suffix}"))
         rewrite_table(folder, with_cell("frame_id", number, str(first + number)))
-    recording = plain.PlainRecording(root)
+    recording = plain_reader.PlainRecording(root)
     (sequence,) = recording.sequences
     for index in range(6):
         frame = recording.read(sequence, index)
@@ -96,7 +99,7 @@ def test_files_are_found_under_other_paddings_and_cases(tmp_path, name):
     rename_images(root / "train/a", name)
     (root / "train/a/image/.DS_Store").touch()
     (root / "train/a/image/Thumbs.db").touch()
-    recording = plain.PlainRecording(root)
+    recording = plain_reader.PlainRecording(root)
     assert pieces(recording)[0] == ("train/a", 0, 10)
     assert (recording.read(recording.sequences[0], 7)["image"] == 7).all()
 
@@ -105,13 +108,13 @@ def test_files_that_no_frame_can_be_told_of_are_refused(tmp_path):
     root = writers.write_plain(tmp_path)
     rename_images(root / "train/a", lambda k: f"frame_{k}.png")
     with pytest.raises(schema.DataError, match=r"no file is named by the number of its frame.* found frame_0.png"):
-        plain.PlainRecording(root)
+        plain_reader.PlainRecording(root)
     rename = root / "train/b/image"
     for path in (root / "train/a/image").iterdir():
         path.unlink()
     (rename / "3.png").write_bytes((rename / "000003.png").read_bytes())
     with pytest.raises(schema.DataError, match=r"000003.png and 3.png are both frame 3. Remove one"):
-        plain.PlainRecording(root)
+        plain_reader.PlainRecording(root)
 
 
 def save(path, pixels, **options):
@@ -143,7 +146,7 @@ def test_pictures_of_other_pixels_are_refused(tmp_path, name, pixels, message):
             save(path, pixels)
     labels = frozenset({"depth_m", "image_classes"})
     with pytest.raises(schema.DataError, match=message or "expected 8 bits"):
-        recording = plain.PlainRecording(root, labels=labels)
+        recording = plain_reader.PlainRecording(root, labels=labels)
         recording.read(recording.sequences[0], 0)
 
 
@@ -187,20 +190,20 @@ def test_pictures_are_turned_as_the_camera_was_held(tmp_path, orientation):
 def test_arrays_that_cannot_be_are_refused(tmp_path, file, name, values, message):
     root = writers.write_plain(tmp_path, {"train/a": 4})
     np.savez(root / f"train/a/{file}/000000.npz", **{name: values})
-    recording = plain.PlainRecording(root)
+    recording = plain_reader.PlainRecording(root)
     with pytest.raises(schema.DataError, match=message):
         recording.read(recording.sequences[0], 0)
 
 
 def test_a_folder_that_one_run_has_more_takes_no_frame_from_the_others(tmp_path):
     root = writers.write_plain(tmp_path, {"train/a": 10, "train/b": 10, "train/c": 10, "val_rl/d": 10})
-    before = pieces(plain.PlainRecording(root))
+    before = pieces(plain_reader.PlainRecording(root))
     (root / "train/a/depth").mkdir()  # empty
-    assert pieces(plain.PlainRecording(root, labels=frozenset({"depth_m"}))) == before
+    assert pieces(plain_reader.PlainRecording(root, labels=frozenset({"depth_m"}))) == before
     for number in range(10):
         save(root / f"train/a/depth/{number:06d}.png", np.full((32, 64), 100, np.uint16))
     with pytest.warns(schema.DataWarning, match=r"depth_m is recorded in 1 of 4 runs \(train/a\) only and is not used"):
-        recording = plain.PlainRecording(root, labels=frozenset({"depth_m"}))
+        recording = plain_reader.PlainRecording(root, labels=frozenset({"depth_m"}))
     assert pieces(recording) == before and "depth_m" not in recording.description.modalities
 
 
@@ -212,12 +215,12 @@ def test_a_run_without_a_sensor_is_passed_by_only_where_it_is_needed(tmp_path, e
     if not empty:
         (root / "train/b/lidar").rmdir()
     with pytest.warns(schema.DataWarning, match=r"points_m is missing in 1 of 4 runs \(train/b\)"):
-        recording = plain.PlainRecording(root)
+        recording = plain_reader.PlainRecording(root)
     assert [sequence.lacks for sequence in recording.sequences] == [(), ("points_m",), (), ()]
     assert "points_m" not in recording.read(recording.sequences[1], 0)
     config = config_lib.override_all(presets.tiny(), {"data.stride": 1})
-    adapted = prepare.adapt(config, recording).config
-    blind = prepare.adapt(config_lib.override_all(config, {"model.lidar": "none", "model.heads": ["image", "action"]}),
+    adapted = fitting.adapt(config, recording).config
+    blind = fitting.adapt(config_lib.override_all(config, {"model.lidar": "none", "model.heads": ["image", "action"]}),
                           recording).config
     names = {}
     for what, chosen in (("both", adapted), ("camera alone", blind)):
@@ -232,10 +235,10 @@ def test_a_split_that_lacks_what_is_needed_is_said_so(tmp_path):
     for path in (root / "val_rl/d/image").iterdir():
         path.unlink()
     with pytest.warns(schema.DataWarning, match="image is missing in 1 of 3 runs"):
-        recording = plain.PlainRecording(root)
+        recording = plain_reader.PlainRecording(root)
     config = config_lib.override_all(presets.tiny(), {"data.stride": 1})
     with pytest.raises(schema.DataError, match=r"split 'val_rl' that has image has 0 frames, but a window needs 8"):
-        prepare.adapt(config, recording)
+        fitting.adapt(config, recording)
 
 
 @pytest.mark.parametrize("column", ["reward", "is_terminal", "x_m"])
@@ -246,14 +249,14 @@ def test_a_column_that_one_run_lacks_is_not_switched_off_for_the_others(tmp_path
         rewrite_table(root / run, lambda text: text.replace(column, f"other_{column}"))
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", schema.DataWarning)
-        recording = plain.PlainRecording(root)
+        recording = plain_reader.PlainRecording(root)
     assert pieces(recording)[:2] == [("train/a", 0, 5), ("train/a", 5, 5)]
     field = fields.COLUMNS[column].name
     assert field in recording.description.modalities
     frame = recording.read(recording.sequences[2], 0)
     assert recording.sequences[2].name == "train/b" and (field in frame) == (column == "is_terminal")
     config = config_lib.override_all(presets.tiny(), {"data.stride": 1})
-    frames = pipeline.Frames(recording, prepare.adapt(config, recording).config)
+    frames = pipeline.Frames(recording, fitting.adapt(config, recording).config)
     batch = frames.batch([windows.Window(sequence, 0, 4, 1) for sequence in recording.sequences[1:4]])
     assert (batch.reward is None) == (column == "reward") and batch.is_terminal is not None
 
@@ -288,16 +291,16 @@ def test_a_column_that_one_run_lacks_is_not_switched_off_for_the_others(tmp_path
 ])
 def test_descriptions_that_cannot_be_are_refused_by_name(tmp_path, changes, message):
     with pytest.raises(schema.DataError, match=f"recording.toml.*{message}"):
-        plain.PlainRecording(writers.write_plain(tmp_path, {"train/a": 2}, **changes))
+        plain_reader.PlainRecording(writers.write_plain(tmp_path, {"train/a": 2}, **changes))
 
 
 def test_one_rate_is_said_once(tmp_path):
     root = writers.write_plain(tmp_path, {"train/a": 30}, rate_hz="20")
-    assert plain.PlainRecording(root).description.contract.rate_hz == 20.0  # the section does not say one
+    assert plain_reader.PlainRecording(root).description.contract.rate_hz == 20.0  # the section does not say one
     path = root / "recording.toml"
     path.write_text(path.read_text().replace("[action]\n", "[action]\nrate_hz = 10.0\n"))
     with pytest.raises(schema.DataError, match=r"rate_hz is 20, but action.rate_hz is 10: a step would last two times"):
-        plain.PlainRecording(root)
+        plain_reader.PlainRecording(root)
 
 
 def test_a_description_with_a_byte_order_mark_and_one_with_a_slip(tmp_path):
@@ -305,24 +308,24 @@ def test_a_description_with_a_byte_order_mark_and_one_with_a_slip(tmp_path):
     path = root / "recording.toml"
     text = path.read_text()
     path.write_text("\ufeff" + text, encoding="utf-8")
-    assert plain.PlainRecording(root).description.name == "test"
+    assert plain_reader.PlainRecording(root).description.name == "test"
     path.write_text(text.replace("[voxels]", "[voxel]"))
     with pytest.raises(schema.DataError, match=r"'voxel' is unknown. Did you mean voxels\?"):
-        plain.PlainRecording(root)
+        plain_reader.PlainRecording(root)
 
 
 def test_route_maps_have_the_scale_that_the_recording_says(tmp_path):
     root = writers.write_plain(tmp_path, {"train/a": 30, "val_rl/b": 30})
-    assert plain.PlainRecording(root).description.route_map == config_lib.RouteMap()
+    assert plain_reader.PlainRecording(root).description.route_map == config_lib.RouteMap()
     with (root / "recording.toml").open("a") as file:
         file.write("[route_map]\nmetres_per_px = 0.5\nego_row = 60\n")
-    config = prepare.adapt(presets.tiny(), plain.PlainRecording(root)).config
+    config = fitting.adapt(presets.tiny(), plain_reader.PlainRecording(root)).config
     assert config.data.route_map == config_lib.RouteMap(0.5, 60.0, 32.0)
 
 
 def test_the_writer_refuses_slips_and_numbers_that_cannot_be(tmp_path):
     frame = {"frame_id": 0, "timestamp_s": 0.0, "speed_mps": 1.0, "acceleration": 0.0, "steering": 0.0}
-    writer = recorder.RunWriter(tmp_path, "train", "a")
+    writer = plain_writer.RunWriter(tmp_path, "train", "a")
     with pytest.raises(ValueError, match=r"'speed_mp' is unknown.* Did you mean speed_mps\?"):
         writer.write(frame | {"speed_mp": 3.0})
     with pytest.raises(schema.DataError, match=r"frame 0: steering is 35; it must be"):
@@ -338,10 +341,10 @@ def test_home_folders_are_expanded(tmp_path, monkeypatch):
     writers.write_plain(tmp_path / "rec", {"train/a": 2})
     drive = writers.write_kitti(tmp_path / "kitti")
     assert sources.open_recording("~/rec").sequences
-    assert plain.PlainRecording("~/rec").sequences
-    assert kitti.KittiRecording(f"~/kitti/{drive.parent.name}").sequences
-    recorder.RunWriter("~/mine", "train", "a").close()
-    assert recorder.is_complete("~/mine", "train", "a") and (tmp_path / "mine/train/a/frames.csv").is_file()
+    assert plain_reader.PlainRecording("~/rec").sequences
+    assert kitti_reader.KittiRecording(f"~/kitti/{drive.parent.name}").sequences
+    plain_writer.RunWriter("~/mine", "train", "a").close()
+    assert plain_writer.is_complete("~/mine", "train", "a") and (tmp_path / "mine/train/a/frames.csv").is_file()
 
 
 def kitti_bytes(drive, name, change):
@@ -378,11 +381,11 @@ def test_kitti_numbers_that_cannot_be_are_refused(tmp_path, name, change, messag
     drive = writers.write_kitti(tmp_path)
     kitti_bytes(drive, name, change)
     if message is None:
-        recording = kitti.KittiRecording(drive)
+        recording = kitti_reader.KittiRecording(drive)
         assert recording.read(recording.sequences[0], 0)["speed_mps"] == 10.0
         return
     with pytest.raises(schema.DataError, match=message):
-        recording = kitti.KittiRecording(drive)
+        recording = kitti_reader.KittiRecording(drive)
         recording.read(recording.sequences[0], 0)
 
 
@@ -393,13 +396,13 @@ def test_one_drive_with_more_takes_no_drive_away(tmp_path):
         shutil.copytree(drive, other)
         shutil.rmtree(other / "velodyne_points")
     with pytest.warns(schema.DataWarning, match="only 1 of 3 drives have velodyne_points: it is not used"):
-        recording = kitti.KittiRecording(tmp_path)
+        recording = kitti_reader.KittiRecording(tmp_path)
     assert len({sequence.name for sequence in recording.sequences}) == 3 and recording.description.lidar is None
 
 
 def test_frames_without_what_the_model_needs_are_refused_by_name(tmp_path):
-    recording = plain.PlainRecording(writers.write_plain(tmp_path, {"train/a": 30, "val_rl/b": 30}))
-    config = prepare.adapt(presets.tiny(), recording).config
+    recording = plain_reader.PlainRecording(writers.write_plain(tmp_path, {"train/a": 30, "val_rl/b": 30}))
+    config = fitting.adapt(presets.tiny(), recording).config
     frame = recording.read(recording.sequences[0], 0)
     del frame["points_m"]
     with pytest.raises(schema.DataError, match="frame 0 has no points_m, which the model needs"):

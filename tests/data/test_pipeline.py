@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from muvo_jax import config as config_lib
 from muvo_jax import presets
-from muvo_jax.data import pipeline, prepare, schema, windows
+from muvo_jax.data import fitting, pipeline, schema, windows
 
 CAMERA = schema.Camera(64, 32, ((32, 0, 32), (0, 32, 16), (0, 0, 1)), tuple(map(tuple, np.eye(4).tolist())))
 
@@ -49,7 +49,7 @@ def frames_of(*sequences, **data):
     preset = presets.get("tiny")
     preset = dataclasses.replace(preset, data=dataclasses.replace(preset.data, **data),
                                  model=dataclasses.replace(preset.model, heads=("image", "range_view", "action")))
-    return pipeline.Frames(recording, prepare.adapt(preset, recording).config)
+    return pipeline.Frames(recording, fitting.adapt(preset, recording).config)
 
 
 def take(iterator, count):
@@ -97,7 +97,7 @@ def test_the_first_action_stands_for_a_step_where_the_contract_says_so_and_every
 def test_adapting_to_a_recording_keeps_what_the_run_says_of_steps():
     frames = frames_of()
     config = dataclasses.replace(frames.config, contract=config_lib.ActionContract(step_action="first"))
-    assert prepare.adapt(config, frames.recording).config.contract.step_action == "first"
+    assert fitting.adapt(config, frames.recording).config.contract.step_action == "first"
 
 
 @settings(max_examples=50, deadline=None)
@@ -309,11 +309,11 @@ def test_motion_since_the_frame_before_is_made_of_poses():
     preset = presets.get("tiny")
     model = dataclasses.replace(preset.model, heads=("action", "ego_motion"), speed=False)
     config = dataclasses.replace(preset, model=model, data=dataclasses.replace(preset.data, frames=3, stride=2))
-    prepare.check_targets(config, recording.description)
-    frames = pipeline.Frames(recording, prepare.adapt(config, recording).config)
+    fitting.check_targets(config, recording.description)
+    frames = pipeline.Frames(recording, fitting.adapt(config, recording).config)
     motion = next(pipeline.train_batches(frames, seed=0, batch=1)).ego_motion
     np.testing.assert_allclose(motion[0, 1:, :3], [[2, 0, 0], [2, 0, 0]], atol=1e-6)
     np.testing.assert_allclose(np.diff(motion[0, :, 3]), [2, 2])  # the speed of frame k is k
     blind = dataclasses.replace(recording.description, modalities=frozenset({"speed_mps"}))
     with pytest.raises(schema.DataError, match=r"head 'ego_motion' learns from pose.* \(--heads=action\)"):
-        prepare.check_targets(config, blind)
+        fitting.check_targets(config, blind)

@@ -9,17 +9,19 @@ import recording_writers as writers
 
 from muvo_jax import config as config_lib
 from muvo_jax import presets
-from muvo_jax.data import kitti, plain, prepare, schema
+from muvo_jax.data import fitting, prepare, schema
+from muvo_jax.data.kitti import reader as kitti_reader
+from muvo_jax.data.plain import reader as plain_reader
 
 
 @pytest.fixture
 def kitti_recording(tmp_path):
-    return kitti.KittiRecording(writers.write_kitti(tmp_path, frames=24))
+    return kitti_reader.KittiRecording(writers.write_kitti(tmp_path, frames=24))
 
 
 @pytest.fixture
 def plain_recording(tmp_path):
-    return plain.PlainRecording(writers.write_plain(tmp_path))
+    return plain_reader.PlainRecording(writers.write_plain(tmp_path))
 
 
 def with_description(recording, **changes):
@@ -29,7 +31,7 @@ def with_description(recording, **changes):
 
 
 def test_kitti_gives_the_town_preset_its_sensors(kitti_recording):
-    config, notes = prepare.adapt(presets.get("town"), kitti_recording)
+    config, notes = fitting.adapt(presets.get("town"), kitti_recording)
     # 128x48 scaled to 256 columns has 96 rows, a multiple of 32
     assert config.model.image_size == (96, 256)
     lidar = config.model.range_view
@@ -37,9 +39,9 @@ def test_kitti_gives_the_town_preset_its_sensors(kitti_recording):
     # 2048 beams in 128 columns are 16 in each, too few of which a memory would hold
     assert (lidar.rows, lidar.columns) == (preset.rows, 2 * preset.columns)
     assert any("range views have 256 columns instead of 128" in note for note in notes)
-    kept, _ = prepare.adapt(presets.get("town"), kitti_recording, keep={"model.range_view.columns"})
+    kept, _ = fitting.adapt(presets.get("town"), kitti_recording, keep={"model.range_view.columns"})
     assert kept.model.range_view.columns == preset.columns
-    assert lidar.position_m == (0.0, 0.0, 1.73) and lidar.elevation_max_rad == kitti.LIDAR.elevation_max_rad
+    assert lidar.position_m == (0.0, 0.0, 1.73) and lidar.elevation_max_rad == kitti_reader.LIDAR.elevation_max_rad
     assert config.model.voxels == presets.get("town").model.voxels
     assert not config.model.route and config.model.speed
     assert config.contract.source == "derived"
@@ -47,34 +49,34 @@ def test_kitti_gives_the_town_preset_its_sensors(kitti_recording):
 
 
 def test_a_short_recording_gets_short_windows(kitti_recording):
-    config, notes = prepare.adapt(presets.get("town"), kitti_recording)  # 16 frames train, 8 validate
+    config, notes = fitting.adapt(presets.get("town"), kitti_recording)  # 16 frames train, 8 validate
     data = config.data
     assert (data.stride, data.context, data.horizon, data.frames) == (1, 4, 4, 8)
     assert any("short recording" in note and "16 frames" in note for note in notes)
-    assert prepare.adapt(config, kitti_recording).config == config
+    assert fitting.adapt(config, kitti_recording).config == config
 
 
 def test_what_the_user_chose_is_kept(kitti_recording):
     preset = config_lib.override(presets.get("town"), "data.context", 2)
-    data = prepare.adapt(preset, kitti_recording, keep={"data.context"}).config.data
+    data = fitting.adapt(preset, kitti_recording, keep={"data.context"}).config.data
     assert (data.context, data.horizon) == (2, 4)
 
 
 def test_windows_that_fit_stay(plain_recording):
-    assert prepare.adapt(presets.get("tiny"), plain_recording).config.data == presets.get("tiny").data
+    assert fitting.adapt(presets.get("tiny"), plain_recording).config.data == presets.get("tiny").data
 
 
 def test_sequences_shorter_than_the_window(tmp_path):
-    recording = plain.PlainRecording(writers.write_plain(tmp_path, {"train/a": 9, "val_rl/b": 7}))
+    recording = plain_reader.PlainRecording(writers.write_plain(tmp_path, {"train/a": 9, "val_rl/b": 7}))
     with pytest.raises(schema.DataError, match="'val_rl' has 7 frames, but a window of 8 frames at stride 1 needs 8"):
-        prepare.adapt(presets.get("town"), recording)
+        fitting.adapt(presets.get("town"), recording)
     keep = {"data.frames": 8, "data.stride": 2}
     with pytest.raises(schema.DataError, match="'train' has 9 frames, but a window of 8 frames at stride 2 needs 15"):
-        prepare.adapt(config_lib.override_all(presets.get("town"), keep), recording, keep=keep)
+        fitting.adapt(config_lib.override_all(presets.get("town"), keep), recording, keep=keep)
 
 
 def test_recorded_voxels_route_and_contract_are_used(plain_recording):
-    config, _ = prepare.adapt(presets.get("tiny"), plain_recording)
+    config, _ = fitting.adapt(presets.get("tiny"), plain_recording)
     assert config.model.voxels == plain_recording.description.voxels
     assert config.model.route and config.model.range_view.position_m == (0.5, 0.0, 2.0)
     frame = prepare.prepare_frame(plain_recording.read(plain_recording.sequences[0], 3), config)
@@ -85,52 +87,52 @@ def test_recorded_voxels_route_and_contract_are_used(plain_recording):
 
 
 def test_a_small_recorded_grid_gets_a_shallower_voxel_decoder(plain_recording):
-    config, notes = prepare.adapt(presets.get("paper-occupancy"), plain_recording)
+    config, notes = fitting.adapt(presets.get("paper-occupancy"), plain_recording)
     assert config.model.occupancy_blocks == 1 and any("voxel decoder" in note for note in notes)
     odd = config_lib.VoxelGrid(shape=(20, 16, 16))
     with pytest.raises(schema.DataError, match=r"20x16x16 .*multiple of 8"):
-        prepare.adapt(presets.get("tiny"), with_description(plain_recording, voxels=odd))
+        fitting.adapt(presets.get("tiny"), with_description(plain_recording, voxels=odd))
 
 
 def test_what_every_model_needs(plain_recording):
     for lacking in ({"points_m", "image"}, {"action"}):
         without = plain_recording.description.modalities - lacking
         with pytest.raises(schema.DataError, match="every model needs actions and, with their sensor's description"):
-            prepare.adapt(presets.get("tiny"), with_description(plain_recording, modalities=without))
+            fitting.adapt(presets.get("tiny"), with_description(plain_recording, modalities=without))
 
 
 def test_a_model_without_the_sensor_that_a_recording_lacks(plain_recording):
     tiny, modalities = presets.get("tiny"), plain_recording.description.modalities
     blind = with_description(plain_recording, modalities=modalities - {"image", "intrinsics"}, camera=None)
-    config, notes = prepare.adapt(tiny, blind)
+    config, notes = fitting.adapt(tiny, blind)
     assert (config.model.camera, config.model.lidar) == ("none", "rv")
     assert config.model.heads == ("range_view", "occupancy", "action")
     assert "no images are recorded: the model has no camera input and no head image." in notes
-    assert prepare.adapt(config, blind).config == config
+    assert fitting.adapt(config, blind).config == config
     raw = plain_recording.read(plain_recording.sequences[0], 0)
     assert not {"image", "intrinsics", "camera_to_ego"} & prepare.prepare_frame(raw, config).keys()
 
-    config, _ = prepare.adapt(tiny, with_description(plain_recording, modalities=modalities - {"points_m"}))
+    config, _ = fitting.adapt(tiny, with_description(plain_recording, modalities=modalities - {"points_m"}))
     assert (config.model.camera, config.model.lidar) == ("wob", "none")
     assert config.model.heads == ("image", "occupancy", "action")  # occupancy is recorded
-    config, notes = prepare.adapt(tiny, with_description(plain_recording, modalities=modalities - {
+    config, notes = fitting.adapt(tiny, with_description(plain_recording, modalities=modalities - {
         "points_m", "occupancy"}, lidar=None, voxels=None))
     assert config.model.heads == ("image", "action")
     assert "no lidar scans are recorded: the model has no lidar input and no head occupancy, range_view." in notes
     raw.pop("points_m")
     assert "range_view" not in prepare.prepare_frame(raw, config)
     with pytest.raises(schema.DataError, match="lacks camera: nothing is left to see"):
-        prepare.adapt(config_lib.override(tiny, "model.lidar", "none"), blind)
+        fitting.adapt(config_lib.override(tiny, "model.lidar", "none"), blind)
 
 
 def test_a_flat_image_is_taken_wider_than_the_preset(kitti_recording):
-    config, notes = prepare.adapt(presets.get("tiny"), kitti_recording)
+    config, notes = fitting.adapt(presets.get("tiny"), kitti_recording)
     # 128x48 has 24 rows at the preset's 64 columns and 36 at 96
     assert config.model.image_size == (32, 96) and any("become 96x32" in note for note in notes)
 
 
 def test_the_scan_makes_the_occupancy_where_none_is_recorded(kitti_recording):
-    config, _ = prepare.adapt(presets.get("tiny"), kitti_recording)
+    config, _ = fitting.adapt(presets.get("tiny"), kitti_recording)
     raw = kitti_recording.read(kitti_recording.sequences[0], 0)
     raw["points_m"] = np.array([[9.0, 0.1, 1.73]], np.float32)
     occupancy = prepare.prepare_frame(raw, config)["occupancy"]
@@ -141,7 +143,7 @@ def test_the_scan_makes_the_occupancy_where_none_is_recorded(kitti_recording):
 
 
 def test_the_intrinsics_follow_the_image(tmp_path, kitti_recording):
-    config, _ = prepare.adapt(config_lib.override(presets.get("town"), "model.image_size", (64, 192)), kitti_recording)
+    config, _ = fitting.adapt(config_lib.override(presets.get("town"), "model.image_size", (64, 192)), kitti_recording)
     assert config.model.image_size == (64, 192)  # 128x48 -> 192x72, 8 rows cut off at the top
     frame = prepare.prepare_frame(kitti_recording.read(kitti_recording.sequences[0], 0), config)
     assert frame["image"].shape == (64, 192, 3)
@@ -149,7 +151,7 @@ def test_the_intrinsics_follow_the_image(tmp_path, kitti_recording):
 
 
 def test_a_frame_that_does_not_fit_is_named(plain_recording):
-    config, _ = prepare.adapt(presets.get("tiny"), plain_recording)
+    config, _ = fitting.adapt(presets.get("tiny"), plain_recording)
     raw = plain_recording.read(plain_recording.sequences[0], 2)
     raw["image"] = raw["image"][:8]
     with pytest.raises(schema.DataError, match="frame 2: image of 8x64"):
@@ -164,4 +166,4 @@ def test_a_head_that_the_recording_cannot_teach_is_refused_by_name(kitti_recordi
     preset = presets.get("tiny")
     config = dataclasses.replace(preset, model=dataclasses.replace(preset.model, heads=("image", "birds_eye")))
     with pytest.raises(schema.DataError, match=r"head 'birds_eye' learns from birds_eye.* \(--heads=image\)"):
-        prepare.check_targets(config, kitti_recording.description)
+        fitting.check_targets(config, kitti_recording.description)

@@ -7,10 +7,12 @@ import pytest
 import recording_samples as samples
 
 from muvo_jax import presets
-from muvo_jax.data import carla, pipeline, plain, prepare, schema
-from muvo_jax.data.town import boxes, record, settings
-from muvo_jax.data.town.simulator import Town
+from muvo_jax.data import fitting, pipeline, prepare, schema
+from muvo_jax.data.muvo import reader as muvo_reader
+from muvo_jax.data.plain import reader as plain_reader
 from muvo_jax.ops import camera, range_view
+from muvo_jax.town import boxes, record, settings
+from muvo_jax.town.simulator import Town
 
 HEADS = ("image", "depth", "semantic_image", "semantic_range_view", "birds_eye")
 CONFIG = dataclasses.replace(presets.tiny(), model=dataclasses.replace(presets.tiny().model, heads=HEADS),
@@ -25,12 +27,12 @@ def recording(tmp_path_factory):
     record.describe(folder, town_config, ("train",))
     for _ in record.record_run(folder, Town(town_config), record.TownDrive("train", "000_day", 7, "clear_noon", 8)):
         pass
-    return plain.PlainRecording(folder, labels=prepare.labels(CONFIG))
+    return plain_reader.PlainRecording(folder, labels=prepare.labels(CONFIG))
 
 
 def test_the_town_teaches_every_optional_head(recording):
-    prepare.check_targets(CONFIG, recording.description)
-    model = prepare.adapt(dataclasses.replace(CONFIG, data=dataclasses.replace(CONFIG.data, stride=1)), recording)
+    fitting.check_targets(CONFIG, recording.description)
+    model = fitting.adapt(dataclasses.replace(CONFIG, data=dataclasses.replace(CONFIG.data, stride=1)), recording)
     assert model.config.model.semantic_classes == len(boxes.CLASSES) == CONFIG.model.semantic_classes
     batch = pipeline.Frames(recording, model.config).batch([pipeline.windows_lib.Window(
         recording.sequences[0], 0, 2, 1)])
@@ -53,7 +55,7 @@ def test_the_town_teaches_every_optional_head(recording):
 
 
 def test_scores_are_told_where_road_users_move_and_training_is_not(recording):
-    config = prepare.adapt(dataclasses.replace(CONFIG, data=dataclasses.replace(CONFIG.data, stride=1)),
+    config = fitting.adapt(dataclasses.replace(CONFIG, data=dataclasses.replace(CONFIG.data, stride=1)),
                            recording).config
     frames, window = pipeline.Frames(recording, config), pipeline.windows_lib.Window(recording.sequences[0], 0, 2, 1)
     assert not {name for name, value in vars(frames.batch([window])).items() if value is not None and "moving" in name}
@@ -75,12 +77,12 @@ def test_the_ground_plan_holds_the_road_and_whole_vehicles(recording):
 
 
 def test_labels_are_read_only_where_asked_for(recording):
-    usual = plain.PlainRecording(next(iter(recording._runs.values())).folder.parents[1])
+    usual = plain_reader.PlainRecording(next(iter(recording._runs.values())).folder.parents[1])
     assert not schema.LABELS & usual.read(usual.sequences[0], 0).keys()
     with pytest.raises(schema.DataError, match="head 'depth' learns from depth_m"):
-        prepare.check_targets(dataclasses.replace(CONFIG, loss=presets.tiny().loss), usual.description)
+        fitting.check_targets(dataclasses.replace(CONFIG, loss=presets.tiny().loss), usual.description)
     with pytest.raises(schema.DataError, match=r"loss\.image_instance is on and learns from image_instance_mask"):
-        prepare.check_targets(CONFIG, usual.description)
+        fitting.check_targets(CONFIG, usual.description)
 
 
 def test_another_head_does_not_rename_the_recording():
@@ -99,7 +101,7 @@ def test_a_nearest_crop_shows_the_pixels_of_the_image():
 
 @pytest.mark.skipif(samples.MUVO_LAYOUT is None, reason="needs a recording in the MUVO layout (MUVO_LAYOUT)")
 def test_the_muvo_layout_gives_all_labels():
-    recording = carla.CarlaRecording(samples.MUVO_LAYOUT, labels=schema.LABELS)
+    recording = muvo_reader.MuvoRecording(samples.MUVO_LAYOUT, labels=schema.LABELS)
     raw = recording.read(recording.sequences[0], 0)
     assert raw.keys() >= schema.LABELS and len(recording.description.classes) == 23
     assert raw["depth_m"].shape == raw["image_classes"].shape == raw["image"].shape[:2]

@@ -9,7 +9,12 @@ import recording_writers as writers
 from PIL import Image
 
 from muvo_jax import voxelize as command
-from muvo_jax.data import carla, carla_runs, plain, recorder, safe_pickle, schema, voxelizing
+from muvo_jax.data import schema, voxelizing
+from muvo_jax.data.muvo import reader as muvo_reader
+from muvo_jax.data.muvo import runs as muvo_runs
+from muvo_jax.data.muvo import safe_pickle
+from muvo_jax.data.plain import reader as plain_reader
+from muvo_jax.data.plain import writer as plain_writer
 
 needs_layout = pytest.mark.skipif(samples.MUVO_LAYOUT is None,
                                   reason="no recording in the MUVO layout here; name one by MUVO_LAYOUT=FOLDER")
@@ -30,7 +35,7 @@ def recording(tmp_path):
         (run / "depth").mkdir()
         for frame in range(2):
             Image.new("RGB", (3, 3)).save(run / f"image/{frame:06d}.png")
-            Image.fromarray(recorder.encode_depth(depth_m)).save(run / f"depth/{frame:06d}.png")
+            Image.fromarray(plain_writer.encode_depth(depth_m)).save(run / f"depth/{frame:06d}.png")
             np.savez(run / f"lidar/{frame:06d}.npz", points_m=np.array([[-3.5, 5.5, 0.5]], np.float32))
     return root
 
@@ -48,7 +53,7 @@ def test_rays_carve_what_they_pass_and_the_rest_is_unknown(recording):
     expected[0:5, 8, 2], expected[5, 8, 2] = 0, 1  # the camera: from x -7.5 to -2.5
     expected[0:4, 13, 2], expected[4, 13, 2] = 0, 1  # the lidar: to x -3.5
     np.testing.assert_array_equal(grid, expected)
-    read = plain.PlainRecording(recording)
+    read = plain_reader.PlainRecording(recording)
     np.testing.assert_array_equal(read.read(read.sequences[-1], 1)["occupancy"], expected)
 
 
@@ -102,7 +107,7 @@ def test_missing_sensors_are_told_before_anything_is_written(recording, tmp_path
     with pytest.raises(schema.DataError, match="no frame has a lidar scan"):
         voxelizing.voxelize(recording)
     assert not list(recording.glob("*/*/occupancy"))
-    header = recording / plain.DESCRIPTION_FILE
+    header = recording / plain_reader.DESCRIPTION_FILE
     header.write_text(header.read_text().partition("[voxels]")[0])
     with pytest.raises(schema.DataError, match=r"no section \[voxels\], the grid to fill; add one"):
         voxelizing.voxelize(recording)
@@ -131,14 +136,14 @@ def layout(tmp_path):
 @needs_layout
 def test_the_reference_rule_writes_the_authors_voxels(layout):
     run = layout / "trainval/train/Town01/0000"
-    table = safe_pickle.load_table(run / carla_runs.FRAME_FILE)
+    table = safe_pickle.load_table(run / muvo_runs.FRAME_FILE)
     shutil.rmtree(run / "voxel")
     columns = {name: cells[:12] for name, cells in table.items() if name != "voxel_path"}
-    (run / carla_runs.FRAME_FILE).write_bytes(voxelizing.frame_pickle.frame(columns))
+    (run / muvo_runs.FRAME_FILE).write_bytes(voxelizing.frame_pickle.frame(columns))
     assert voxelizing.voxelize(layout, rule="reference", workers=2) == (12, 0)
     for path in (run / "voxel").glob("*.npy"):
         assert path.read_bytes() == (samples.MUVO_LAYOUT / path.relative_to(layout)).read_bytes()
-    written = safe_pickle.load_table(run / carla_runs.FRAME_FILE)
+    written = safe_pickle.load_table(run / muvo_runs.FRAME_FILE)
     assert list(written) == list(table) and list(written["voxel_path"]) == list(table["voxel_path"][:12])
     for name in columns:
         for old, new in zip(columns[name], written[name], strict=True):
@@ -149,14 +154,14 @@ def test_the_reference_rule_writes_the_authors_voxels(layout):
 @needs_layout
 def test_carved_occupancy_of_the_layout_is_read_in_place_of_its_voxels(layout):
     run = layout / "trainval/train/Town01/0000"
-    table = safe_pickle.load_table(run / carla_runs.FRAME_FILE)
-    (run / carla_runs.FRAME_FILE).write_bytes(voxelizing.frame_pickle.frame(
+    table = safe_pickle.load_table(run / muvo_runs.FRAME_FILE)
+    (run / muvo_runs.FRAME_FILE).write_bytes(voxelizing.frame_pickle.frame(
         {name: cells[:12] for name, cells in table.items()}))
-    opened = carla.CarlaRecording(layout)
+    opened = muvo_reader.MuvoRecording(layout)
     theirs = opened.read(opened.sequences[0], 1)["occupancy"]
     before = (run / "voxel/voxel_000000011.npy").read_bytes()
     assert voxelizing.voxelize(layout, workers=1).made == 12
-    opened = carla.CarlaRecording(layout)
+    opened = muvo_reader.MuvoRecording(layout)
     frame = opened.read(opened.sequences[0], 1)
     ours = frame["occupancy"]
     assert set(np.unique(ours)) == {0, 1, 255}

@@ -1,17 +1,13 @@
 """The reader of the MUVO layout against what the authors' dataset class reads (skipped where there is no file)."""
 
 import json
-import pathlib
 import shutil
-import sys
 
 import numpy as np
 import pytest
+import recording_samples as samples
 
 from muvo_jax.interop.parity import p6, registry, runner
-
-sys.path.append(str(pathlib.Path(__file__).parents[1] / "data"))
-import recording_samples as samples
 
 pytestmark = pytest.mark.skipif(
     samples.MUVO_LAYOUT is None or samples.GOLDEN is None or not (samples.GOLDEN / p6.POINTERS_FILE).is_file(),

@@ -67,9 +67,13 @@ def test_above_the_road_are_the_layers_that_lie_wholly_half_a_metre_over_it(orig
     assert occupancy.above_road(grid) == slice(first, None)
 
 
-def test_occupied_means_above_one_half():
+@pytest.mark.parametrize(("above", "called"), [(0.5, [False, True, False]), (0.3, [True, True, True]),
+                                               (0.8, [False, False, False])])
+def test_occupied_means_above_the_probability_that_is_asked_for(above, called):
     logits = jnp.array([[0.0, 0.0], [0.0, 0.1], [0.1, 0.0]])
-    np.testing.assert_array_equal(occupancy.predicted_occupied(logits), [False, True, False])
+    np.testing.assert_array_equal(occupancy.predicted_occupied(logits, above), called)
+    some = jnp.array([[1.0, 1.0 + np.log(above / (1 - above)) + step] for step in (-0.01, 0.01)])
+    np.testing.assert_array_equal(occupancy.predicted_occupied(some, above), [False, True])
 
 
 def test_parity_with_the_reference():

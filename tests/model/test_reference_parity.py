@@ -4,21 +4,17 @@ The folder with the files p4 and p5 is the one that the environment variable MUV
 repository. `python -m muvo_jax.interop.parity FOLDER` runs the same checks, and those of the small files.
 """
 
-import pathlib
-import sys
 
 import jax
 import pytest
+import recording_samples as samples
+import torch_writer
 
 import muvo_jax
 from muvo_jax import convert
 from muvo_jax.interop import weights_rule
 from muvo_jax.interop.parity import cases, full_models, golden, registry, runner
 from muvo_jax.training import screen
-
-sys.path.extend(str(pathlib.Path(__file__).parents[1] / folder) for folder in ("data", "interop"))
-import recording_samples as samples
-import torch_writer
 
 FOLDER = samples.GOLDEN
 WHOLE = FOLDER is not None and (FOLDER / "p4_full" / "1d_RV_WOB_TR_voxel.npz").is_file()

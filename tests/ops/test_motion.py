@@ -9,8 +9,8 @@ from hypothesis import strategies
 from hypothesis.extra import numpy as arrays
 
 from muvo_jax import config as config_lib
-from muvo_jax.data.town import simulator
 from muvo_jax.ops import motion
+from muvo_jax.town import simulator
 from muvo_jax.types import Motion
 
 pytestmark = pytest.mark.usefixtures("strict_dtypes")

@@ -19,7 +19,8 @@ def seen(*boxes):
 
 
 def flow(newest, older):
-    return np.asarray(flow_of(jnp.asarray((newest > 0.0).astype(np.float32))[None], jnp.asarray(np.stack(older))[None]))[0]
+    hits = jnp.asarray((newest > 0.0).astype(np.float32))
+    return np.asarray(flow_of(hits[None], jnp.asarray(np.stack(older))[None]))[0]
 
 
 @settings(deadline=None, max_examples=20)

@@ -5,7 +5,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from muvo_jax import config as config_lib
-from muvo_jax.data import carla_files
+from muvo_jax.data.muvo import files as muvo_files
 from muvo_jax.ops import camera, voxels
 
 GRID = config_lib.VoxelGrid(shape=(8, 6, 4), voxel_size_m=0.5, origin_m=(-2.0, -1.0, 0.0))
@@ -124,7 +124,7 @@ def test_voxels_of_depth_and_lidar_agree_with_the_reference():
     seen_m, pixel = camera.reference_depth_points(depth_m, np.deg2rad(110), (1.0, 0.0, 2.0))
     points_m = np.concatenate([seen_m, lidar_m])
     tags = np.concatenate([of_pixels[pixel], make_input("vf_lsem", (60000,), "ints23")])
-    kept = ~carla_files.in_ego_box(points_m)
+    kept = ~muvo_files.in_ego_box(points_m)
     assert golden.error("merge/points", points_m[kept]) < 1e-5
     table = voxels.voxel_table(points_m[kept], tags[kept], config_lib.VoxelGrid(), winning_tag=6)
     np.testing.assert_array_equal(table[:, :3], golden["voxel_filter/coords"])

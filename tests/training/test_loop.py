@@ -15,7 +15,7 @@ from jax.experimental.compilation_cache import compilation_cache
 
 from muvo_jax import config as config_lib
 from muvo_jax import presets
-from muvo_jax.data import schema
+from muvo_jax.data import fitting, schema
 from muvo_jax.model import world_model
 from muvo_jax.training import checkpoint, checkpoint_meta, integrity, loop, preparation, run_folder, screen
 from muvo_jax.training import step as step_lib
@@ -293,10 +293,10 @@ def test_bad_data_leaves_no_run_folder_behind(tmp_path):
 
 
 def test_expected_batch_is_what_the_pipeline_makes():
-    from muvo_jax.data import pipeline, prepare
+    from muvo_jax.data import pipeline
 
     recording = MemoryRecording()
-    config = prepare.adapt(_config(), recording).config
+    config = fitting.adapt(_config(), recording).config
     batch = next(pipeline.train_batches(pipeline.Frames(recording, config), seed=0, batch=2))
     expected = preparation.expected_batch(config, 2, recorded=recording.description.modalities)
     assert jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype), batch) == expected

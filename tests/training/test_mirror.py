@@ -13,9 +13,9 @@ from hypothesis import strategies as st
 from muvo_jax import config as config_lib
 from muvo_jax import presets, types
 from muvo_jax.data import ego_motion
-from muvo_jax.data.town import renderer
 from muvo_jax.ops import motion as motion_ops
 from muvo_jax.ops import range_view, voxels
+from muvo_jax.town import renderer
 from muvo_jax.training import mirror
 from muvo_jax.training import step as step_lib
 

@@ -30,16 +30,17 @@ def train(recording_path: str) -> dict:
     import numpy as np
     import small_world
 
-    from muvo_jax.data import pipeline, plain, prepare
+    from muvo_jax.data import fitting, pipeline
+    from muvo_jax.data.plain import reader as plain_reader
     from muvo_jax.training import loop, parallel, state
     from muvo_jax.training import optimizer as optimizer_lib
     from muvo_jax.training import step as step_lib
 
-    recording = plain.PlainRecording(recording_path)
+    recording = plain_reader.PlainRecording(recording_path)
     config = small_world.make_config(ACCUMULATE, heads=("image", "action"))
     # Nobody labelled instances in this recording.
     config = dataclasses.replace(config, loss=dataclasses.replace(config.loss, image_instance=0.0))
-    config = prepare.adapt(config, recording, keep=("data.frames",)).config
+    config = fitting.adapt(config, recording, keep=("data.frames",)).config
     source = pipeline.TrainBatches(pipeline.Frames(recording, config), seed=0, batch=loop.windows_per_step(config),
                                    process=jax.process_index(), processes=jax.process_count(), accumulate=ACCUMULATE)
     model = small_world.SmallWorld(config.model)

@@ -21,7 +21,10 @@ import numpy as np
 import scipy.ndimage
 
 from muvo_jax import config as config_lib
-from muvo_jax.data import carla, carla_files, carla_runs, files, schema
+from muvo_jax.data import files, schema
+from muvo_jax.data.muvo import files as muvo_files
+from muvo_jax.data.muvo import reader as muvo_reader
+from muvo_jax.data.muvo import runs as muvo_runs
 from muvo_jax.interop.parity import cases, golden
 from muvo_jax.ops import camera as camera_ops
 from muvo_jax.ops import range_view as range_view_ops
@@ -29,7 +32,7 @@ from muvo_jax.ops import range_view as range_view_ops
 POINTERS_FILE = "p6_pointers.json"
 _ROWS_HZ = 10.0
 _MOST_POINTS, _BIRDVIEW_SIDE = 60_000, 192  # where the arrays do not say
-_VEHICLE_BITS = (1 << carla_files.BIRDVIEW_BITS.index("vehicle")) | (1 << carla_files.BIRDVIEW_BITS.index("pedestrian"))
+_VEHICLE_BITS = (1 << muvo_files.BIRDVIEW_BITS.index("vehicle")) | (1 << muvo_files.BIRDVIEW_BITS.index("pedestrian"))
 # Of the range view: share of the pixels that may differ, and how much the others may.
 _PIXEL_SHARE, _XYZ_M, _RANGE_M = 5e-4, 1e-5, 1e-4
 Checks = Iterator[cases.Check]
@@ -51,7 +54,7 @@ class _Recordings:
         except (OSError, ValueError) as error:
             raise golden.GoldenError(f"{path}: expected the pointers of the file ({error}).") from error
         self.config = self.expected["config"]
-        self.runs = carla_runs.find_runs(context.recordings)
+        self.runs = muvo_runs.find_runs(context.recordings)
 
 
 def batches(context: cases.Context) -> Checks:
@@ -73,7 +76,7 @@ def starts(frames: int, length: int, stride: int, skipped: int) -> range:
     return range(skipped, frames - stride * length)
 
 
-def pointers(runs: list[carla_runs.Run], split: str, length: int, config: Mapping) -> list[list]:
+def pointers(runs: list[muvo_runs.Run], split: str, length: int, config: Mapping) -> list[list]:
     """[run, frames] of every window of a split, in the authors' order; runs of little reward are left out."""
     stride, skipped = int(config["STRIDE_SEC"] * _ROWS_HZ), int(config["FILTER_BEGINNING"] * _ROWS_HZ)
     return [[_short(run), list(range(start, start + length * stride, stride))] for run in runs
@@ -81,7 +84,7 @@ def pointers(runs: list[carla_runs.Run], split: str, length: int, config: Mappin
             for start in starts(run.frames, length, stride, skipped)]
 
 
-def _short(run: carla_runs.Run) -> str:
+def _short(run: muvo_runs.Run) -> str:
     return run.name.removeprefix(f"{run.split}/")
 
 
@@ -115,7 +118,7 @@ def pointer_lists(context: cases.Context) -> Checks:
             yield _alone(name, bounds, theirs)
 
 
-def _data_module(runs: list[carla_runs.Run], config: Mapping) -> dict[str, Any]:
+def _data_module(runs: list[muvo_runs.Run], config: Mapping) -> dict[str, Any]:
     """Sizes of the authors' data module: all validation sets are its test set, every 50th window validates.
 
     The second and third validation sets are entered late, so that small ones give nothing.
@@ -147,45 +150,45 @@ def _batch(batch: str, described: Mapping, recordings: _Recordings) -> Checks:
             yield cases.Check(f"{batch}/{name}", ours, *_MEASURES.get(name, (0.0, _different)))
 
 
-def _read_frame(run: carla_runs.Run, row: int, config: Mapping, shapes: Mapping) -> dict[str, np.ndarray]:
+def _read_frame(run: muvo_runs.Run, row: int, config: Mapping, shapes: Mapping) -> dict[str, np.ndarray]:
     """One frame under the names and in the form of the authors' batches, all of their optional entries included.
 
     `shapes` are those of the batch's entries: the recording does not say how large range views and clouds are.
     """
-    *_, rows, columns = shapes.get("range_view_pcd_xyzd", (carla.LIDAR.rows, carla.LIDAR.columns))
+    *_, rows, columns = shapes.get("range_view_pcd_xyzd", (muvo_reader.LIDAR.rows, muvo_reader.LIDAR.columns))
     *_, most_points, _ = shapes.get("points_raw", (_MOST_POINTS, 3))
-    lidar = dataclasses.replace(carla.LIDAR, rows=rows, columns=columns)
-    action = carla_runs.actions(run)[row]
+    lidar = dataclasses.replace(muvo_reader.LIDAR, rows=rows, columns=columns)
+    action = muvo_runs.actions(run)[row]
     image = files.read_image(run.path("image", row), "RGB")
-    depth, tags = carla_files.read_depth_semantic(run.path("depth_semantic", row))
-    birdview = carla_files.read_birdview(run.path("birdview", row))
-    scan = carla_files.read_points(run.path("points_semantic", row), lidar.position_m)
+    depth, tags = muvo_files.read_depth_semantic(run.path("depth_semantic", row))
+    birdview = muvo_files.read_birdview(run.path("birdview", row))
+    scan = muvo_files.read_points(run.path("points_semantic", row), lidar.position_m)
     height_px, width_px = config["IMAGE_SIZE"]
-    classes = carla_files.is_occupied(tags).astype(np.int64)
+    classes = muvo_files.is_occupied(tags).astype(np.int64)
     raw = np.zeros((most_points, 3), np.float32)
     raw[:len(scan.points_m)] = scan.points_m[:most_points]
     bits = int(run.columns["n_classes"][row])
     planes = _bit_planes(birdview, bits)
     frame = {
         "image": image.transpose(2, 0, 1),
-        "route_map": np.repeat(carla_files.read_route_map(run.path("routemap", row))[None], 3, axis=0),
+        "route_map": np.repeat(muvo_files.read_route_map(run.path("routemap", row))[None], 3, axis=0),
         "birdview": planes.astype(np.float32),
         "birdview_label": np.where(planes, np.arange(bits)[:, None, None], 0).max(axis=0)[None],
         "instance_label": scipy.ndimage.label(birdview & _VEHICLE_BITS)[0][None].astype(np.int32),
         "range_view_pcd_xyzd": range_view_ops.project(scan.points_m, lidar).transpose(2, 0, 1),
         "points_raw": raw, "num_points": np.int64(len(scan.points_m)),
-        "image_instance_mask": np.isin(tags, (carla_files.PEDESTRIAN, carla_files.VEHICLE))[None],
+        "image_instance_mask": np.isin(tags, (muvo_files.PEDESTRIAN, muvo_files.VEHICLE))[None],
         "semantic_image": classes[None], "depth": np.where(depth > 0.999, -1.0, depth)[None],
         "depth_color": files.read_image(run.path("depth_semantic", row), "RGBA")[..., :3].transpose(2, 0, 1) / 255.0,
         "throttle_brake": action[:1], "steering": action[1:], "speed": run.numbers("speed", 1)[row],
         "reward": np.clip(run.numbers("reward", 1)[row], -1.0, 1.0), "value_function": run.numbers("value", 1)[row],
         "intrinsics": camera_ops.intrinsics_from_fov(width_px, height_px, math.radians(config["IMAGE_FOV"])),
-        "extrinsics": camera_ops.level_camera_to_ego(carla.MOUNT_M),
+        "extrinsics": camera_ops.level_camera_to_ego(muvo_reader.MOUNT_M),
     }
     if scan.tags is not None:
         frame["range_view_pcd_seg"] = _range_classes(scan, lidar)[None]
     if "voxel_path" in run.columns:
-        frame["voxel"] = carla_files.read_voxels(run.path("voxel", row), carla.VOXELS)[None]
+        frame["voxel"] = muvo_files.read_voxels(run.path("voxel", row), muvo_reader.VOXELS)[None]
     return frame
 
 
@@ -193,7 +196,7 @@ def _bit_planes(birdview: np.ndarray, bits: int) -> np.ndarray:
     return (birdview[None] >> np.arange(bits, dtype=np.uint16)[:, None, None] & 1).astype(bool)
 
 
-def _range_classes(scan: carla_files.Points, geometry: config_lib.RangeViewGeometry) -> np.ndarray:
+def _range_classes(scan: muvo_files.Points, geometry: config_lib.RangeViewGeometry) -> np.ndarray:
     """Class of the nearest point of each pixel, in float64 as the authors compute it; 0 where empty."""
     points_m = scan.points_m.astype(np.float64)
     relative_m = points_m - np.asarray(geometry.position_m)[None]
@@ -206,7 +209,7 @@ def _range_classes(scan: carla_files.Points, geometry: config_lib.RangeViewGeome
     order = np.argsort(-range_m, kind="stable")
     classes = np.zeros((geometry.rows, geometry.columns), np.int64)
     assert scan.tags is not None
-    classes[row[order], column[order]] = carla_files.is_occupied(scan.tags)[order]
+    classes[row[order], column[order]] = muvo_files.is_occupied(scan.tags)[order]
     return classes
 
 

@@ -7,7 +7,8 @@ from collections.abc import Iterator
 import numpy as np
 
 from muvo_jax import config as config_lib
-from muvo_jax.data import carla_files, schema
+from muvo_jax.data import schema
+from muvo_jax.data.muvo import files as muvo_files
 from muvo_jax.interop import reference_data
 from muvo_jax.interop import reference_preprocess as preprocess
 from muvo_jax.interop.parity import cases, golden, rounding
@@ -68,10 +69,10 @@ def depth_images(context: cases.Context) -> Checks:
     yield cases.Check("convert_coor_lidar", _to_ego(_cloud(context)[:wanted[0]]), TOLERANCE)
     size = context.shape("carla_decode/depth_m", "carla_decode/sem") or context.size("p2", "carla_decode_hw")
     pixels = context.draw("carla_bgra", (*size, 4), "ints256")
-    depth_m = carla_files.DEPTH_RANGE_M * carla_files.decode_depth(pixels[..., 2::-1])
+    depth_m = muvo_files.DEPTH_RANGE_M * muvo_files.decode_depth(pixels[..., 2::-1])
     yield cases.Check("carla_decode/depth_m", depth_m, TOLERANCE)
     yield cases.Check("carla_decode/sem", pixels[..., 3], 0.0, golden.File.share_different)
-    yield cases.Check("label_map", carla_files.is_occupied(np.arange(23)).astype(np.uint8), 0.0)
+    yield cases.Check("label_map", muvo_files.is_occupied(np.arange(23)).astype(np.uint8), 0.0)
 
 
 def fused_voxels(context: cases.Context) -> Checks:
@@ -82,12 +83,12 @@ def fused_voxels(context: cases.Context) -> Checks:
     points, pixel = camera.reference_depth_points(depth, _FIELD_OF_VIEW_RAD, preprocess.CAMERA_POSITION_M)
     points = np.concatenate([points, _to_ego(lidar)])
     tags = np.concatenate([depth_tags.reshape(-1)[pixel], lidar_tags]).astype(np.uint8)
-    keep = ~carla_files.in_ego_box(points)
+    keep = ~muvo_files.in_ego_box(points)
     points, tags = points[keep], tags[keep]
     yield cases.Check("merge/n", np.array(points.shape), 0.0)
     yield cases.Check("merge/points", points, TOLERANCE)
     yield cases.Check("merge/sem", tags[:, None], SHARE_TOLERANCE, golden.File.share_different)
-    table = voxels.voxel_table(points, tags, _GRID, winning_tag=carla_files.ROAD_LINE)
+    table = voxels.voxel_table(points, tags, _GRID, winning_tag=muvo_files.ROAD_LINE)
     yield cases.Check("voxel_filter/coords", table, SHARE_TOLERANCE, _voxels_apart)
     yield cases.Check("voxel_filter/sem", table, SHARE_TOLERANCE, _voxel_tags_apart)
 
@@ -138,7 +139,7 @@ def birdviews(context: cases.Context) -> Checks:
     yield cases.Check("bev/processed", processed, 0.0)
     yield cases.Check("bev/route", route, 0.0)
     tags = draw("bev_semimg", context.shape("bev/instance_mask") or (1, 30, 40), "labels23")
-    mask = schema.instance_mask(carla_files.known_classes(tags), carla_files.CLASSES)
+    mask = schema.instance_mask(muvo_files.known_classes(tags), muvo_files.CLASSES)
     yield cases.Check("bev/instance_mask", mask, 0.0)
 
 

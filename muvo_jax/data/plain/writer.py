@@ -1,0 +1,180 @@
+"""Writes the plain recording format that reader.py reads: folders of PNG, NPZ, CSV and TOML, nothing pickled.
+
+A run counts once its frames.csv is there, and that is written last, by renaming: whatever interrupts a recording leaves
+either a complete run or one that readers ignore, and recording again goes on where it stopped. Depth maps (16-bit PNG,
+centimetres, 65535 in the sky) and class images are kept for people and other models, too.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import pathlib
+import shutil
+from collections.abc import Mapping
+
+import numpy as np
+from PIL import Image
+
+from muvo_jax import config as config_lib
+from muvo_jax.data import description, fields, files, schema
+from muvo_jax.data.plain import frames_table
+from muvo_jax.data.plain import reader as plain_reader
+
+COLUMNS = ("frame_id", "timestamp_s", "x_m", "y_m", "yaw_rad", "speed_mps", "acceleration", "steering", "reward",
+           "is_terminal", "weather")
+DEPTH_UNIT_M, DEPTH_SKY = plain_reader.DEPTH_UNIT_M, plain_reader.DEPTH_SKY
+_NO_FILE = fields.Field("", np.uint8)
+# Names of RawFrame and what recorders call them: both are taken.
+_ALIASES = {"classes": "image_classes", "point_tags": "point_classes"}
+# Of RawFrame, but kept in the description, or made of another field.
+_NOT_WRITTEN = ("intrinsics", "camera_to_ego", "image_instance_mask")
+KEYS = frozenset((*COLUMNS, *fields.COLUMNS, *fields.FIELDS, *_ALIASES))
+
+
+def write_description(root: pathlib.Path | str, *, name: str, rate_hz: float, splits: tuple[str, ...],
+                      contract: config_lib.ActionContract, camera: schema.Camera | None = None,
+                      lidar: config_lib.RangeViewGeometry | None = None,
+                      voxels: config_lib.VoxelGrid | None = None, classes: tuple[str, ...] = (),
+                      route_map: config_lib.RouteMap | None = None) -> pathlib.Path:
+    """Writes ROOT/recording.toml, what holds for every run; sensors that are None are left out.
+
+    Args:
+      classes: names of the classes, in their order; readers take the town's (fields.TOWN_CLASSES) where there are none.
+      route_map: scale of the route maps; None is the town's.
+
+    Raises:
+      FileExistsError: where ROOT holds a different description (runs of different settings must not be mixed).
+    """
+    root = pathlib.Path(root).expanduser()
+    text = files.to_toml({"schema_version": plain_reader.SCHEMA_VERSION, "name": name, "rate_hz": float(rate_hz),
+                          "splits": list(splits)} | ({"classes": list(classes)} if classes else {}),
+                         description.tables(action=contract, camera=camera, lidar=lidar, voxels=voxels,
+                                            route_map=route_map))
+    path = root / plain_reader.DESCRIPTION_FILE
+    if path.exists():
+        if path.read_text(encoding="utf-8") != text:
+            raise FileExistsError(f"{path} describes another recording (other sensors, splits or actions); choose "
+                                  f"another folder or remove this one.")
+        return path
+    root.mkdir(parents=True, exist_ok=True)
+    files.write_atomically(path, text)
+    return path
+
+
+def is_complete(root: pathlib.Path | str, split: str, run: str) -> bool:
+    """Whether a run was recorded to its end, so that it need not be recorded again."""
+    return (pathlib.Path(root).expanduser() / split / run / plain_reader.FRAMES_FILE).is_file()
+
+
+class RunWriter:
+    """Records one run: `write` each frame in order, then `close`. A run that is not closed stays incomplete.
+
+    Opening a run removes what an interrupted attempt left there.
+    """
+
+    def __init__(self, root: pathlib.Path | str, split: str, run: str):
+        """Raises FileExistsError where the run is complete already."""
+        self.folder = pathlib.Path(root).expanduser() / split / run
+        if is_complete(root, split, run):
+            raise FileExistsError(f"{self.folder} is recorded already; remove it to record it again.")
+        shutil.rmtree(self.folder, ignore_errors=True)
+        self.folder.mkdir(parents=True)
+        self._rows: list[dict[str, str]] = []
+
+    def write(self, frame: Mapping) -> None:
+        """Writes the files of one frame.
+
+        Args:
+          frame: either as a reader gives it (schema.RawFrame), which is then read back bit for bit; or frame_id (int)
+            and timestamp_s, the other names of COLUMNS as far as they are known, and any of image uint8 [H, W, 3],
+            depth_m float [H, W] (infinite in the sky; centimetres are kept), classes and route_map uint8 [H, W],
+            image_moving_mask bool [H, W] and occupancy_moving_mask bool [X, Y, Z],
+            points_m float [N, 3] (with point_tags uint8 [N], what each hit), occupancy uint8 [X, Y, Z],
+            birds_eye_classes uint8 [X, Y] with birds_eye_instances int32 [X, Y].
+
+        Raises:
+          ValueError: where frame_id does not increase, a name is unknown (naming the nearest), or DataError where a
+            field is of another shape or has numbers that it cannot have.
+        """
+        fields.unknown(frame, KEYS, f"{self.folder}: field")
+        frame_id = int(frame["frame_id"])
+        where = f"{self.folder}, frame {frame_id}"
+        if self._rows and frame_id <= int(self._rows[-1]["frame_id"]):
+            raise ValueError(f"frame_id {frame_id} after {self._rows[-1]['frame_id']}: frames must be written in "
+                             f"order.")
+        row = _row(frame, where)
+        arrays = {name: fields.conform(name, value, where) for key, value in frame.items()
+                  if fields.FIELDS.get(name := _ALIASES.get(key, key), _NO_FILE).folder and name not in _NOT_WRITTEN}
+        depth_m = arrays.pop("depth_m", None)
+        if depth_m is not None:
+            self._write_depth(frame_id, depth_m, exactly="action" in frame)
+        packed: dict[str, dict[str, np.ndarray]] = {}
+        for name, array in arrays.items():
+            field = fields.FIELDS[name]
+            if field.array:
+                packed.setdefault(field.folder, {})[field.array] = array
+            else:
+                self._save_png(field.folder, frame_id, array)
+        for folder, contents in packed.items():
+            self._path(folder, frame_id, ".npz").write_bytes(files.npz_bytes(contents))
+        self._rows.append(row)
+
+    def close(self) -> None:
+        """Completes the run."""
+        table = io.StringIO(newline="")
+        more = [name for name in fields.COLUMNS if name not in COLUMNS and any(name in row for row in self._rows)]
+        writer = csv.DictWriter(table, (*COLUMNS, *more), restval="", lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(self._rows)
+        files.write_atomically(self.folder / plain_reader.FRAMES_FILE, table.getvalue())
+
+    def _path(self, folder: str, frame_id: int, suffix: str) -> pathlib.Path:
+        path = self.folder / folder / f"{frame_id:06d}{suffix}"
+        path.parent.mkdir(exist_ok=True)
+        return path
+
+    def _write_depth(self, frame_id: int, depth_m: np.ndarray, *, exactly: bool) -> None:
+        """As centimetres; where these would not give the same numbers again, and that is asked for, as they are."""
+        centimetres = encode_depth(depth_m)
+        if exactly and not np.array_equal(plain_reader.decode_depth(centimetres), depth_m):
+            self._path("depth", frame_id, ".npz").write_bytes(files.npz_bytes({"depth_m": depth_m}))
+        else:
+            self._save_png("depth", frame_id, centimetres)
+
+    def _save_png(self, folder: str, frame_id: int, pixels: np.ndarray) -> None:
+        Image.fromarray(np.ascontiguousarray(pixels)).save(self._path(folder, frame_id, ".png"), compress_level=1)
+
+
+def _row(frame: Mapping, where: str) -> dict[str, str]:
+    """A line of frames.csv: the columns of the table of fields, and the weather.
+
+    Raises:
+      DataError: for a number that its field cannot have.
+    """
+    row = {name: _cell(frame[name]) for name in COLUMNS if name in frame}
+    for name, field in fields.FIELDS.items():
+        if name in frame and field.columns:
+            values = np.atleast_1d(fields.conform(name, frame[name], where))
+            row = {column: _cell(value) for column, value in zip(field.columns, values, strict=True)} | row
+    for column, field in fields.COLUMNS.items():
+        if column in frame and field.shape:
+            frames_table.number(row[column], field, f"{where}: {column}")
+    return row
+
+
+def encode_depth(depth_m: np.ndarray) -> np.ndarray:
+    """Metres along the optical axis to uint16 centimetres; what is infinite or beyond 655.34 m is sky."""
+    centimetres = np.rint(np.where(np.isfinite(depth_m), depth_m, np.inf) / DEPTH_UNIT_M)
+    return np.minimum(centimetres, DEPTH_SKY).astype(np.uint16)
+
+
+def _cell(value) -> str:
+    """A field of frames.csv; numbers keep all their digits."""
+    if isinstance(value, str):
+        return value
+    if isinstance(value, (bool, np.bool_)):
+        return "true" if value else "false"
+    if isinstance(value, (int, np.integer)):
+        return str(int(value))
+    return str(value) if isinstance(value, np.floating) else repr(float(value))

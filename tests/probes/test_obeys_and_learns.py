@@ -3,7 +3,7 @@
 Measured (gain / correlation): bar 0.93 / 0.97 (1d) and 0.95 / 0.98 (2d), with memory 0.99 / 0.98 (2d); wall 0.99 / 0.95
 (1d), with memory 1.10 / 0.99 (1d) and 1.12 / 0.93 (2d). The 2D latent without memory has 0.70 / 0.98 of the wall: it
 knows when the wall comes nearer, but its frames are too small an answer. Observed ones are off by 1.9 m where the 1D
-latent's are by 0.4 m, so the decoder of tokens is to blame, not the action. The 1D latent with memory has 0.75 / 0.81
+latent's are by 0.4 m: what it draws of a state falls short before any action. The 1D latent with memory has 0.75 / 0.81
 of the bar, and draws observed frames worse than imagined ones.
 """
 
@@ -19,7 +19,7 @@ from muvo_jax.model import camera, lidar
 WORLDS = {"bar": probe_worlds.Bar(), "wall": probe_worlds.Wall()}
 UNSTEADY = pytest.mark.xfail(strict=True, reason="observed frames are drawn far off, perhaps by the running statistics "
                              "of a lidar that always sees the same")
-FAINT = pytest.mark.xfail(strict=True, reason="the decoder of tokens draws ranges too near their mean")
+FAINT = pytest.mark.xfail(strict=True, reason="ranges are drawn too near their mean, of observed frames too")
 NOISE = 10.0  # standard deviation of the noise in the overfitted batch, grey values
 
 

@@ -27,7 +27,8 @@ def variables():
 @functools.cache
 def bank():
     draw = lambda seed, channels: jax.random.normal(jax.random.key(seed), (STARTS, channels))
-    latent = LatentState(jnp.tanh(draw(1, CONFIG.deterministic_channels)), draw(2, CONFIG.stochastic_channels))
+    sizes = CONFIG.latent
+    latent = LatentState(jnp.tanh(draw(1, sizes.deterministic_channels)), draw(2, sizes.stochastic_channels))
     route_map = jnp.zeros((STARTS, 64, 64), jnp.uint8).at[:, :, 30:34].set(255)
     return environment_lib.StartBank(latent, jnp.linspace(2.0, 8.0, STARTS), route_map)
 

@@ -99,7 +99,7 @@ def test_half_precision_of_the_old_format(tiny, tmp_path):
     (lambda state: (state.clear(), state.update({"fc.weight": np.zeros((2, 2), np.float32)})), r"such as fc\.weight"),
 ])
 def test_what_does_not_fit_is_named_and_leaves_no_folder(damage, message, tmp_path):
-    state_dict = names.reference_state_dict(drawn_variables(TINY), TINY)
+    state_dict = names.reference_state_dict(drawn_variables(TINY.model), TINY.model)
     damage(state_dict)
     torch_writer.write_zip(tmp_path / "a.ckpt", {"state_dict": torch_writer.tensors(
         {f"model.{key}": value for key, value in state_dict.items()})})
@@ -120,7 +120,7 @@ def test_a_checkpoint_without_tensors_and_an_occupied_folder(tmp_path):
 
 
 def test_weights_that_are_not_finite_are_said(tmp_path, capsys):
-    state_dict = names.reference_state_dict(drawn_variables(TINY), TINY)
+    state_dict = names.reference_state_dict(drawn_variables(TINY.model), TINY.model)
     state_dict["policy.fc.6.bias"] = np.array([np.nan, 0.0], np.float32)
     torch_writer.write_zip(tmp_path / "a.ckpt", checkpoint_of(state_dict))
     run_convert(tmp_path / "a.ckpt", tmp_path / "run")
@@ -141,7 +141,7 @@ def test_a_full_disk_is_named_and_leaves_no_folder(tmp_path, monkeypatch):
 @pytest.mark.slow
 def test_a_converted_run_is_judged_dreams_and_trains_on(tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    state_dict = names.reference_state_dict(drawn_variables(TINY), TINY)
+    state_dict = names.reference_state_dict(drawn_variables(TINY.model), TINY.model)
     torch_writer.write_zip(tmp_path / "a.ckpt", checkpoint_of(state_dict))
     run_convert(tmp_path / "a.ckpt", tmp_path / "run")
     judged = evaluate.evaluate(evaluate.Options(tmp_path / "run", splits=("val_rl",), windows=1, batch=1),

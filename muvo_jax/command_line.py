@@ -158,7 +158,7 @@ def process_start_s() -> float:
 
 
 def parse_settings(settings: Iterable[str]) -> dict[str, Any]:
-    """{"model.dropout": 0.0} from ["model.dropout=0.0"]; a value that is not JSON is text.
+    """{"model.fusion.dropout": 0.0} from ["model.fusion.dropout=0.0"]; a value that is not JSON is text.
 
     Raises:
       ValueError: where there is no "=".
@@ -167,7 +167,7 @@ def parse_settings(settings: Iterable[str]) -> dict[str, Any]:
     for setting in settings:
         name, equals, text = setting.partition("=")
         if not equals:
-            raise ValueError(f"--set: got {setting!r}, expected name=value, such as --set model.dropout=0.0")
+            raise ValueError(f"--set: got {setting!r}, expected name=value, such as --set model.fusion.dropout=0.0")
         try:
             parsed[name] = json.loads(text)
         except json.JSONDecodeError:

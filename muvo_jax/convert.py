@@ -59,7 +59,7 @@ def convert(options: Options, show: screen.Screen) -> checkpoints.Stored:
     model = checkpoints.recognise(stored)
     match = names.match_state_dict(stored.state_dict, model)
     what = checkpoints.published_name(model)
-    described = f"{model.variant}, {model.latent} latent, heads {', '.join(model.heads)}"
+    described = f"{model.variant}, {model.latent.kind} latent, heads {', '.join(model.heads)}"
     if problems := match.problems():
         raise checkpoints.CheckpointMismatch(
             f"{options.checkpoint}: expected the keys of {described}, to judge by its shapes; found {problems}.")
@@ -70,7 +70,7 @@ def convert(options: Options, show: screen.Screen) -> checkpoints.Stored:
     step = step if type(step) is int and 0 <= step < 2**63 else 0
     ignored = dict(stored.beside) | match.ignored
     report = {"source": str(options.checkpoint.resolve()), "recognised": what, "variant": model.variant,
-              "latent": model.latent, "facts": dict(stored.facts), "mapped": match.mapped, "ignored": ignored,
+              "latent": model.latent.kind, "facts": dict(stored.facts), "mapped": match.mapped, "ignored": ignored,
               "missing": match.missing, "unexpected": match.unexpected, "wrong_shape": match.misshapen}
     _write(options.out, step, names.convert_state_dict(stored.state_dict, model), config, report)
     if broken := [key for key in match.mapped if not np.isfinite(stored.state_dict[key]).all()]:

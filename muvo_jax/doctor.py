@@ -36,7 +36,9 @@ class Options:
     out: Annotated[pathlib.Path | None, command_line.shown("FOLDER", "doctor/NAME")] = None
     """Where the report goes; NAME is that of the folder."""
     camera: Annotated[str, command_line.shown("NAME", "the reader's choice")] = ""
-    """Which camera, where the recording has several (KITTI: image_00 to image_03)."""
+    """Which camera, where the recording has several (KITTI: image_00 to image_03; nuScenes: CAM_FRONT, ...)."""
+    key_frames: tyro.conf.FlagCreatePairsOff[bool] = False
+    """Only key frames, where the recording has them (nuScenes: 2 a second instead of 10)."""
     frames: int = 600
     """How many frames to read, spread over the recording; 0 reads all."""
     workers: Annotated[int | None, command_line.shown("N", "one a processor")] = None
@@ -56,10 +58,10 @@ def examine(options: Options, show: screen.Screen) -> examination.Checkup:
     Raises:
       DataError: where the folder is no recording.
     """
-    kind = sources.recognise(options.path, camera=options.camera)
+    kind = sources.recognise(options.path, camera=options.camera, key_frames=options.key_frames)
     name = options.path.expanduser().resolve().name or "recording"
     try:
-        recording, warned = open_recording(options.path, options.camera)
+        recording, warned = open_recording(options.path, options.camera, key_frames=options.key_frames)
     except schema.DataError as error:
         described, result = None, examination.refused(f"{name} ({kind.name})", error)
     else:
@@ -83,11 +85,12 @@ def examine(options: Options, show: screen.Screen) -> examination.Checkup:
     return result
 
 
-def open_recording(path: pathlib.Path, camera: str = "") -> tuple[schema.Recording, list[tuple[type[Warning], str]]]:
+def open_recording(path: pathlib.Path, camera: str = "", *,
+                   key_frames: bool = False) -> tuple[schema.Recording, list[tuple[type[Warning], str]]]:
     """The recording with every label it holds, and what opening it warned of."""
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        recording = sources.open_recording(path, camera=camera, labels=schema.LABELS)
+        recording = sources.open_recording(path, camera=camera, key_frames=key_frames, labels=schema.LABELS)
     return recording, [(warning.category, str(warning.message)) for warning in caught
                        if issubclass(warning.category, schema.DataWarning)]
 

@@ -36,7 +36,9 @@ class Options:
     out: Annotated[pathlib.Path, tyro.conf.Positional, tyro.conf.arg(metavar="OUT")]
     """The folder for the shards; read it as any other recording."""
     camera: Annotated[str, command_line.shown("NAME", "the reader's choice")] = ""
-    """Which camera, where the recording has several (KITTI: image_00 to image_03)."""
+    """Which camera, where the recording has several (KITTI: image_00 to image_03; nuScenes: CAM_FRONT, ...)."""
+    key_frames: tyro.conf.FlagCreatePairsOff[bool] = False
+    """Only key frames, where the recording has them (nuScenes: 2 a second instead of 10)."""
     labels: bool = True
     """Pack depth, classes and other labels too, as far as they are recorded."""
     jpeg_quality: Annotated[int | None, command_line.shown("N", "PNG")] = None
@@ -59,7 +61,8 @@ def pack(options: Options, show: screen.Screen) -> None:
     with show.counter("packing", "frames") as progress:
         complete = packed_writer.pack(
             options.source, options.out, frames_per_shard=options.frames_per_shard, camera=options.camera,
-            labels=options.labels, encoding=records.Encoding(options.jpeg_quality, options.half_points),
+            key_frames=options.key_frames, labels=options.labels,
+            encoding=records.Encoding(options.jpeg_quality, options.half_points),
             machine=options.machine, machines=options.machines, workers=options.workers, progress=progress)
     seconds = time.perf_counter() - start_s
     if not complete:

@@ -60,12 +60,17 @@ class Options:
     """How to search: improved or plain cross-entropy method, path integrals, gradient ascent."""
     horizon: int = 10
     """Steps to plan ahead."""
-    plans: int = 32
+    plans: int = 64
     """Candidate plans of an iteration (icem, cem, mppi)."""
     iterations: int = 3
     """Refinements of a plan."""
+    futures: Literal["one", "each"] = "one"
+    """Imagine one future for all plans of an iteration, or one for each plan: plans times the work."""
+    speed_limit_mps: float = 8.0
+    """What the reward calls too fast; drivers of the town like 8 to 10 m/s."""
     occupancy_scale: Literal[1, 2, 4] = 1
-    """Look for collisions in the occupancy at 1, 1/2 or 1/4 of its resolution; coarser is faster."""
+    """Look for collisions in the occupancy at 1, 1/2 or 1/4 of its resolution: coarser is faster and more cautious, and
+    too coarse is refused."""
     seed: int = 0
     """Of the drives and of the planner."""
     out: Annotated[pathlib.Path | None, command_line.shown("PATH", "RUN/plan_drive")] = None
@@ -88,9 +93,10 @@ def plan_drive(options: Options, show: screen.Screen) -> dict[str, Any]:
     town = simulator.Town(settings.from_config(config))
     world = town_simulator(town, config)
     imagination = environment.Environment.of_run(loaded, reward_config=rewards.RewardConfig(
-        occupancy_scale=options.occupancy_scale, collision=5.0 if "occupancy" in config.model.heads else 0.0))
+        occupancy_scale=options.occupancy_scale, speed_limit_mps=options.speed_limit_mps,
+        collision=rewards.RewardConfig.collision if "occupancy" in config.model.heads else 0.0))
     planner = closed_loop.planning_driver(world, imagination, loaded.variables, *planner_of(options),
-                                          horizon=options.horizon)
+                                          horizon=options.horizon, shared_future=options.futures == "one")
     drivers = {PLANNED: planner, EXPERT: closed_loop.expert_driver(world),
                "constant": closed_loop.constant_driver(COASTING), "random": closed_loop.random_driver()}
     steps, context = max(1, round(options.seconds / world.step_s)), config.data.context
@@ -110,6 +116,7 @@ def plan_drive(options: Options, show: screen.Screen) -> dict[str, Any]:
     show.line(f"sensitivity to actions, {time.perf_counter() - began_s:.0f} s so far", style="dim")
     report = {"run": str(loaded.folder), "step": loaded.step, "planner": options.planner, "horizon": options.horizon,
               "plans": options.plans, "iterations": options.iterations, "occupancy_scale": options.occupancy_scale,
+              "futures": options.futures, "speed_limit_mps": options.speed_limit_mps,
               "step_s": world.step_s, "seconds": options.seconds, "seeds": seeds, "route_m": town.config.route_m,
               "scores": scores, "sensitivity": answers,
               "drives": {name: [describe(one, seed) for one, seed in zip(runs, seeds, strict=True)]
@@ -168,10 +175,10 @@ def observation(town: simulator.Town, state: simulator.TownState, config: config
     seen = town.render(state)
     fields = {"image": seen["image"], "range_view": seen["range_view"], "route_map": seen["route_map"],
               "speed_mps": np.float32(seen["speed_mps"])}
-    if config.model.lidar == "pp":
-        fields["points"], fields["point_count"] = prepare.padded_points(seen["points_m"], config.model.pillars.points,
-                                                                        0)
-    if config.model.camera == "bev" or config.model.first_guess == "last_seen":
+    lidar, camera, guess = config.model.lidar, config.model.camera, config.model.first_guess
+    if isinstance(lidar, config_lib.PillarLidar):
+        fields["points"], fields["point_count"] = prepare.padded_points(seen["points_m"], lidar.grid.points, 0)
+    if isinstance(camera, config_lib.BirdsEyeCamera) or isinstance(guess, config_lib.LastSeen):
         fields |= {"intrinsics": town.renderer.intrinsics, "camera_to_ego": town.renderer.camera_to_ego}
     return fields
 

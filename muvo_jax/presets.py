@@ -1,4 +1,7 @@
-"""Named configurations. A flag of the command line beats a preset, a preset beats the defaults of config.py."""
+"""Named configurations. A flag of the command line beats a preset, a preset beats the defaults of config/.
+
+What its parts are like, the ones that it does not have included, config/sizes.py says.
+"""
 
 from __future__ import annotations
 
@@ -7,6 +10,7 @@ import difflib
 import math
 
 from muvo_jax import config as config_lib
+from muvo_jax.config import sizes
 
 
 def town() -> config_lib.Config:
@@ -23,35 +27,16 @@ def town() -> config_lib.Config:
     the frames.
     """
     model = config_lib.ModelConfig(
-        latent="2d",
+        fusion=sizes.of("town", config_lib.TransformerFusion),
+        latent=sizes.of("town", config_lib.TokenLatent),
+        first_guess=config_lib.LastSeen(follow_movers=True),
         image_size=(64, 256),
         range_view=config_lib.RangeViewGeometry(rows=64, columns=128),
         voxels=config_lib.VoxelGrid(shape=(48, 48, 8), voxel_size_m=1.0, origin_m=(-24.0, -24.0, -1.5)),
-        pillars=config_lib.PillarGrid(half_side_m=24.0, cells_per_m=2.0, points=8192, channels=16),
-        birds_eye=config_lib.BirdsEyeGrid(cells=24, cell_m=1.0, cells_behind=4, depth_bins=20, lifted_bins=8,
-                                          hidden_channels=128),
         backbone_width=8,
-        map_channels=32,
-        token_channels=96,
-        transformer_layers=2,
-        transformer_heads=4,
-        transformer_hidden_channels=256,
-        dropout=0.0,
-        fused_channels=256,
-        keep_cells=True,
-        embedding_channels=512,
-        deterministic_channels=384,
-        stochastic_channels=128,
         decoder_channels=64,
-        transition_layers=1,
-        aligned_tokens=True,
         occupancy_channels=32,
-        occupancy_blocks=0,
-        occupancy_token_stages=0,
-        first_guess="last_seen",
-        follow_movers=True,
         occupied_above=0.3,
-        guided_channels=(64, 64, 64),
         action_path="recurrence",
         route_encoder="small",
         range_view_points="beams",
@@ -74,28 +59,14 @@ def town() -> config_lib.Config:
 def tiny() -> config_lib.Config:
     """For tests and for a first look at the code: everything runs, nothing is learned."""
     model = config_lib.ModelConfig(
+        fusion=sizes.of("tiny", config_lib.TransformerFusion),
+        latent=sizes.of("tiny", config_lib.VectorLatent),
         image_size=(32, 64),
         range_view=config_lib.RangeViewGeometry(rows=32, columns=64),
         voxels=config_lib.VoxelGrid(shape=(16, 16, 16), voxel_size_m=2.0, origin_m=(-16.0, -16.0, -3.0)),
-        pillars=config_lib.PillarGrid(half_side_m=16.0, cells_per_m=1.0, points=1024, channels=4),
-        birds_eye=config_lib.BirdsEyeGrid(cells=8, cell_m=4.0, cells_behind=2, depth_bins=12, lifted_bins=3,
-                                          hidden_channels=8),
         backbone_width=4,
-        map_channels=8,
-        token_channels=12,
-        transformer_layers=1,
-        transformer_heads=2,
-        transformer_hidden_channels=16,
-        fused_channels=8,
-        embedding_channels=16,
-        deterministic_channels=16,
-        stochastic_channels=8,
-        action_channels=8,
         decoder_channels=8,
-        transition_layers=1,
         occupancy_channels=8,
-        occupancy_blocks=1,
-        occupancy_token_stages=0,
     )
     return config_lib.Config(
         preset="tiny",
@@ -154,7 +125,7 @@ def _reference(preset: str, loss: config_lib.LossConfig, **model) -> config_lib.
 
 def reference_1d() -> config_lib.Config:
     """The released 1D model with occupancy, RV-WOB-TR (176 million parameters, the unused ones included)."""
-    return _reference("reference-1d", config_lib.LossConfig(), latent="1d")
+    return _reference("reference-1d", config_lib.LossConfig(), latent=config_lib.VectorLatent())
 
 
 # The authors' 2D code trains occupancy by geometric affinity alone.
@@ -163,12 +134,13 @@ _REFERENCE_2D_LOSS = config_lib.LossConfig(occupancy_cross_entropy=0.0, occupanc
 
 def reference_2d() -> config_lib.Config:
     """The released 2D model, RV-WOB-TR (119 million parameters)."""
-    return _reference("reference-2d", _REFERENCE_2D_LOSS, latent="2d")
+    return _reference("reference-2d", _REFERENCE_2D_LOSS, latent=config_lib.TokenLatent())
 
 
 def reference_mobilevit() -> config_lib.Config:
     """The released 2D model whose backbones are MobileViT-V2 (114 million parameters)."""
-    return _reference("reference-mobilevit", _REFERENCE_2D_LOSS, latent="2d", backbone="mobilevitv2_100")
+    return _reference("reference-mobilevit", _REFERENCE_2D_LOSS, latent=config_lib.TokenLatent(),
+                      backbone="mobilevitv2_100")
 
 
 PRESETS = {"town": town, "tiny": tiny, "paper": paper, "paper-occupancy": paper_occupancy,

@@ -19,5 +19,5 @@ def open_configured(config: config_lib.Config, progress: record.Progress | None 
     labels = prepare.labels(config)
     if config.data.path == "town":
         return sources.open_recording(record.cached_town(config, progress), labels=labels)
-    return sources.open_recording(config.data.path, camera=config.data.camera, labels=labels,
-                                  skip_corrupt_shards=config.data.skip_corrupt_shards)
+    return sources.open_recording(config.data.path, camera=config.data.camera, key_frames=config.data.key_frames,
+                                  labels=labels, skip_corrupt_shards=config.data.skip_corrupt_shards)

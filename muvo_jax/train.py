@@ -17,7 +17,7 @@ from muvo_jax import command_line, late
 
 with late.imports():
     from muvo_jax import config as config_lib
-    from muvo_jax import config_json, dream, evaluate, presets
+    from muvo_jax import dream, evaluate, presets
     from muvo_jax.interop import backbones
     from muvo_jax.metrics import protocol
     from muvo_jax.objectives import perceptual
@@ -81,7 +81,9 @@ class Options:
     data: Annotated[str | None, command_line.shown("PATH")] = None
     """"town" (built in) or the folder of a recording; its kind is recognised."""
     data_camera: Annotated[str | None, command_line.shown("NAME", "the reader's choice")] = None
-    """Which camera of the recording, where it has several (KITTI: image_00 to image_03)."""
+    """Which camera of the recording, where it has several (KITTI: image_00 to image_03; nuScenes: CAM_FRONT, ...)."""
+    key_frames: tyro.conf.FlagCreatePairsOff[bool] = False
+    """Only key frames, where the recording has them (nuScenes: 2 a second instead of 10)."""
     workers: Annotated[int | None, command_line.shown("N", "one a processor but one, 2 to 16")] = None
     """How many batches are read and decoded side by side, each by a thread."""
     name: Annotated[str | None, command_line.shown("NAME", "made of data, preset and fusion")] = None
@@ -126,7 +128,7 @@ python -m muvo_jax.train --data=/data/kitti_raw --name=kitti
 python -m muvo_jax.train --name=town-tr --resume --steps=800  (goes on with a run)
 python -m muvo_jax.train --init=runs/town-tr --data=/data/kitti_raw  (starts from its weights)
 python -m muvo_jax.train --preset=paper-occupancy --batch=1 --accumulate=1 --steps=1 --no-evaluate
-python -m muvo_jax.train --set loss.kl=0.01 model.dropout=0.0
+python -m muvo_jax.train --set loss.kl=0.01 model.fusion.dropout=0.0
 """
 
 
@@ -156,12 +158,14 @@ def configure(options: Options) -> tuple[config_lib.Config, dict[str, Any], path
     heads = _heads(options, chosen.get("model.heads", base.model.heads))
     if heads is not None:
         chosen["model.heads"] = heads
+    if options.key_frames:
+        chosen["data.key_frames"] = True
     if options.augment or options.no_augment:
         if options.augment and options.no_augment:
             raise ValueError("--augment and --no-augment contradict each other: give one of them.")
         for name in ("image", "route"):
             chosen.setdefault(f"augmentation.{name}", options.augment)
-    if chosen.get("model.fusion", "tr") != "tr" and base.model.latent == "2d":
+    if chosen.get("model.fusion", "tr") != "tr" and isinstance(base.model.latent, config_lib.TokenLatent):
         chosen.setdefault("model.latent", "1d")  # the only one that such a fusion has
     base = config_lib.override_all(base, chosen)
     if (options.perceptual or options.perceptual_from) and "image" not in base.model.heads:
@@ -180,7 +184,7 @@ def _variant_settings(options: Options, settings: Mapping[str, Any]) -> dict[str
     """
     if options.variant is None:
         return {}
-    kinds = (config_lib.LIDAR_ENCODERS, config_lib.CAMERA_ENCODERS, config_lib.FUSIONS)
+    kinds = (config_lib.LIDARS, config_lib.CAMERAS, config_lib.FUSIONS)
     known = ["-".join(parts).upper() for parts in itertools.product(*kinds)]
     if options.variant.upper() not in known:
         raise ValueError(f"--variant={options.variant} is unknown; known are {', '.join(known)}.")
@@ -247,7 +251,7 @@ def _heads(options: Options, heads: Sequence[str]) -> tuple[str, ...] | None:
                    for text in (options.heads, options.with_heads))
     for flag, names in (("--heads", exact), ("--with-heads", more)):
         for name in names:
-            config_json.check_choice(flag, name, tuple(config_lib.KNOWN_HEADS))
+            config_lib.check_choice(flag, name, tuple(config_lib.KNOWN_HEADS))
     if options.no_occupancy and (options.occupancy or "occupancy" in exact + more):
         raise ValueError("--no-occupancy and --occupancy (or --heads and --with-heads with occupancy) contradict each "
                          "other: give one of them.")

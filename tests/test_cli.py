@@ -173,6 +173,8 @@ def test_an_unknown_option_names_its_neighbours(capsys):
     (["--occupancy", "--no-occupancy"], "contradict each other"),
     (["--set", "model.dropot=0"], "'dropot' is unknown"),
     (["--set", "model.dropout"], "expected name=value"),
+    (["--set", "model.memory_frames=3"], "model.memory_frames is called model.first_guess.memory_frames now"),
+    (["--set", "model.latent.aligned_tokens=true"], "is a setting of model.latent=2d (TokenLatent)"),
     (["--set", "train.steps=many"], "train.steps: got 'many', expected int"),
     (["--data=/nowhere/at/all"], "data folder /nowhere/at/all does not exist"),
     (["--name=ghost", "--resume"], "no run to go on with"),
@@ -219,7 +221,7 @@ def test_default_names_tell_runs_apart():
 
 def test_variant_flags_choose_encoders_fusion_latent_and_heads():
     model = train.configure(train.Options(preset="tiny", variant="pp-bev-fc", no_occupancy=True))[0].model
-    assert (model.variant, model.latent) == ("PP-BEV-FC", "1d")
+    assert (model.variant, model.latent.kind) == ("PP-BEV-FC", "1d")
     assert model.heads == ("image", "range_view", "action")
     model = train.configure(train.Options(preset="paper", occupancy=True, backbone="mobilevitv2_100"))[0].model
     assert (model.heads, model.backbone) == (config_lib.HEADS, "mobilevitv2_100")
@@ -230,7 +232,7 @@ def test_variant_flags_choose_encoders_fusion_latent_and_heads():
         with pytest.raises(ValueError, match=message):
             train.configure(options)
     model = train.configure(train.Options(preset="reference-2d", fusion="avg"))[0].model
-    assert (model.variant, model.latent) == ("RV-WOB-AVG", "1d")
+    assert (model.variant, model.latent.kind) == ("RV-WOB-AVG", "1d")
 
 
 @pytest.mark.parametrize(("options", "latent"), [
@@ -238,7 +240,7 @@ def test_variant_flags_choose_encoders_fusion_latent_and_heads():
     (train.Options(fusion="tr", latent="1d"), "1d"), (train.Options(fusion="fc"), "1d"),
     (train.Options(variant="PP-BEV-AVG"), "1d"), (train.Options(preset="reference-1d", fusion="tr"), "1d")])
 def test_the_town_has_the_2d_latent_where_fusion_keeps_tokens(options, latent):
-    assert train.configure(options)[0].model.latent == latent
+    assert train.configure(options)[0].model.latent.kind == latent
 
 
 def test_resume_takes_the_settings_of_the_run_and_refuses_another_preset(tmp_path):

@@ -3,11 +3,15 @@
 import dataclasses
 import json
 import math
+import pathlib
 
 import pytest
 
 from muvo_jax import config as config_lib
 from muvo_jax import limits, presets
+from muvo_jax.config import migration, parts, sizes
+
+KEPT = pathlib.Path(__file__).parent / "kept_runs"  # config.json of version 1
 
 
 @pytest.mark.parametrize("name", sorted(presets.PRESETS))
@@ -21,23 +25,48 @@ def test_json_round_trip_is_exact_and_hashable(name):
 
 def test_override_changes_one_field_and_leaves_the_rest():
     config = presets.get("tiny")
-    changed = config_lib.override(config, "model.dropout", 0)
-    assert changed.model.dropout == 0.0
-    assert isinstance(changed.model.dropout, float)
+    changed = config_lib.override(config, "model.fusion.dropout", 0)
+    assert changed.model.fusion.dropout == 0.0
+    assert isinstance(changed.model.fusion.dropout, float)
+    assert dataclasses.replace(changed.model, fusion=config.model.fusion) == config.model
     assert dataclasses.replace(changed, model=config.model) == config
 
 
+def test_a_part_is_chosen_by_its_kind_and_has_the_size_of_the_preset():
+    tiny = presets.get("tiny")
+    chosen = config_lib.override_all(tiny, {
+        "model.latent.transition_layers": 2, "model.latent": "2d", "model.lidar": "pp", "model.camera": None})
+    assert chosen.model.latent == config_lib.TokenLatent(transition_layers=2, occupancy_token_stages=0)
+    assert chosen.model.lidar == sizes.of("tiny", config_lib.PillarLidar) != config_lib.PillarLidar()
+    assert chosen.model.camera is None and chosen.model.variant == "PP-NONE-TR"
+    wider = config_lib.override(tiny, "model.latent.deterministic_channels", 24)
+    assert config_lib.override(wider, "model.latent", "1d") == wider  # the kind it has already
+    mine = config_lib.TrainingMean()
+    assert config_lib.override(tiny, "model.first_guess", mine).model.first_guess == mine
+
+
 @pytest.mark.parametrize(("field", "value", "message"), [
-    ("model.dropot", 0.1, "Did you mean dropout"),
-    ("modle.dropout", 0.1, "Did you mean model"),
-    ("model.dropout", "much", "got 'much', expected float"),
+    ("model.dropot", 0.1, "Did you mean model.fusion.dropout"),
+    ("modle.dropout", 0.1, "Did you mean model.fusion.dropout"),
+    ("data.frmes", 3, r"'frmes' is unknown; known are path, .*Did you mean data.frames"),
+    ("model.latent.determnistic_channels", 3, "Did you mean model.latent.deterministic_channels"),
+    ("model.image_size.rows", 32, "model.image_size has no settings of its own"),
+    ("model.fusion.dropout", "much", "got 'much', expected float"),
+    ("model.dropout", 0.0, r"model\.dropout is called model\.fusion\.dropout now"),
+    ("model.pillars.points", 99, r"model\.pillars\.points is called model\.lidar\.grid\.points now"),
+    ("model.latent.transition_layers", 2,
+     r"is a setting of model.latent=2d \(TokenLatent\), and model.latent is 1d: .*choose model.latent=2d"),
+    ("model.first_guess.memory_frames", 0, "model.first_guess.memory_frames is 0; it must be at least 1"),
+    ("model.fusion.map_channels", 8, "is a setting of model.fusion=fc or avg"),
+    ("model.latent", {"kind": "2d"}, "known are 1d, 2d"),
     ("train.batch", True, "got True, expected int"),
-    ("model.fusion", "concat", "model.fusion: 'concat' is unknown; known are"),
+    ("model.fusion", "concat", "model.fusion: 'concat' is unknown; known are tr, fc, avg"),
+    ("model.camera", "bew", "'bew' is unknown; known are wob, bev, none. Did you mean bev"),
     ("model.image_size", [64, 100], "must be multiples of 32"),
-    ("model.transformer_heads", 7, "multiple of 4 and of model.transformer_heads 7"),
-    ("model.occupancy_blocks", 9, "each side must be a multiple of 4096"),
-    ("model.pillars.cells_per_m", 1.0, "model.pillars has 48 cells on a side"),
-    ("model.birds_eye.lifted_bins", 99, "lifted_bins 99 lie between 1 and depth_bins"),
+    ("model.fusion.heads", 7, "model.fusion.token_channels is 96; it must be a multiple of 4 and of heads, 7"),
+    ("model.latent.occupancy_blocks", 9, "each side must be a multiple of 4096"),
+    ("model.lidar.grid.cells_per_m", 1.0, "model.lidar.grid has 48 cells on a side"),
+    ("model.camera.grid.lifted_bins", 99, "lifted_bins 99 lie between 1 and depth_bins"),
     ("data.stride", 0, "data.stride is 0; it must be at least 1"),
     ("train.steps", 0, "train.steps is 0; it must be at least 1"),
     ("train.parallel", "pmapp", "Did you mean pmap"),
@@ -49,16 +78,87 @@ def test_bad_values_are_refused_with_the_reason(field, value, message):
         config_lib.override(town, field, value)
 
 
-SETTINGS = [(section, name, whole, limit) for section in
-            ("model", "loss", "optimizer", "data", "augmentation", "train", "evaluation", "contract")
-            for name, limit, whole in limits.of(type(getattr(config_lib.Config(), section)))]
+def test_settings_of_a_sensor_that_the_model_does_not_see_are_refused():
+    blind = config_lib.override(presets.get("tiny"), "model.camera", "none")
+    with pytest.raises(ValueError, match=r"model.camera.grid is a setting of model.camera=bev .*model.camera is none"):
+        config_lib.override(blind, "model.camera.grid.cells", 8)
+    with pytest.raises(ValueError, match="both none"):
+        config_lib.override(blind, "model.lidar", "none")
 
 
-@pytest.mark.parametrize(("section", "name", "whole", "limit"), SETTINGS, ids=[f"{s[0]}.{s[1]}" for s in SETTINGS])
-def test_no_number_of_the_settings_may_be_what_it_cannot_be(section, name, whole, limit):
+@pytest.mark.parametrize("name", sorted(path.stem for path in KEPT.glob("*.json")))
+def test_runs_of_version_1_load_as_todays_presets(name):
+    """What earlier versions wrote: a flat model, in which settings of parts that are not there did nothing. What the
+    preset has got since is off in them."""
+    stored = json.loads((KEPT / f"{name}.json").read_text())
+    assert migration.VERSION_FIELD not in stored
+    config = config_lib.Config.from_dict(stored)
+    assert config_lib.Config.from_dict(json.loads(json.dumps(config.to_dict()))) == config
+    town = presets.get("town")
+    town = dataclasses.replace(town, model=dataclasses.replace(town.model, first_guess=config_lib.LastSeen(),
+                                                               occupied_above=0.5))
+    if name == "kitti_raw-tr":  # fitted to that recording
+        assert config.data.path.endswith("kitti_raw") and config.contract.source == "derived"
+        config = dataclasses.replace(config, data=town.data, contract=town.contract, train=town.train,
+                                     model=dataclasses.replace(config.model, route=True,
+                                                               range_view=town.model.range_view))
+    expected = {"town-tr": town, "kitti_raw-tr": town, "tiny-tr": presets.get("tiny"),
+                "town-pp-none-fc": config_lib.override_all(town, {
+                    "model.lidar": "pp", "model.camera": "none", "model.fusion": "fc", "model.latent": "1d"})}
+    assert config == expected[name]
+
+
+def test_version_1_from_before_it_had_all_of_its_fields_and_what_never_was():
+    stored = json.loads((KEPT / "tiny-tr.json").read_text())
+    for field in ("first_guess", "memory_frames", "guided_channels", "action_path", "kinematics", "many_tokens"):
+        del stored["model"][field]
+    del stored["train"]["restart"], stored["contract"]["step_action"]
+    tiny = presets.get("tiny")
+    old = config_lib.Config.from_dict(stored)
+    assert old.model.first_guess == tiny.model.first_guess and old.model.fusion == tiny.model.fusion
+    assert (old.contract.step_action, tiny.contract.step_action) == ("first", "mean")
+    with pytest.raises(ValueError, match=r"config\.model\.fusion: 'concat' is unknown; known are tr, fc, avg"):
+        config_lib.Config.from_dict({"model": {"fusion": "concat"}})
+    with pytest.raises(ValueError, match=r"\(ModelConfig\): 'colour' is unknown"):
+        config_lib.Config.from_dict({"model": {"colour": 3}})
+    with pytest.raises(ValueError, match="config_version is 3, and this version of muvo_jax reads 1 to 2"):
+        config_lib.Config.from_dict(tiny.to_dict() | {"config_version": 3})
+    with pytest.raises(ValueError, match=r'config.model.latent: got \{\}, expected \{"kind": \.\.\.\} of 1d, 2d'):
+        config_lib.Config.from_dict({"config_version": 2, "model": {"latent": {}}})
+
+
+def test_every_moved_setting_has_a_place_today():
+    places = {f"{part}.{field.name}" for part, (hint, _) in migration._PARTS.items()
+              for cls in parts.kinds(hint).values() for field in dataclasses.fields(cls) if field.init}
+    later = {"first_guess.follow_movers"}  # version 1 had nothing of the kind
+    assert set(migration.MOVED.values()) == places - later
+    fields = {field.name for field in dataclasses.fields(config_lib.ModelConfig)}
+    assert fields.isdisjoint(migration.MOVED) and fields >= migration._PARTS.keys()
+
+
+# Numbers of the sections, and of each part that a model can have.
+SECTIONS = [(section, {}) for section in
+            ("model", "loss", "optimizer", "data", "augmentation", "train", "evaluation", "contract")]
+SECTIONS += [(f"model.{part}", {f"model.{part}": kind}) for part, (hint, _) in migration._PARTS.items()
+             for kind in parts.kinds(hint)]
+
+
+def _below(config, dotted):
+    for name in dotted.split("."):
+        config = getattr(config, name)
+    return config
+
+
+SETTINGS = [(section, choice, name, whole, limit) for section, choice in SECTIONS
+            for name, limit, whole in limits.of(type(_below(config_lib.override_all(presets.tiny(), choice), section)))]
+
+
+@pytest.mark.parametrize(("section", "choice", "name", "whole", "limit"), SETTINGS,
+                         ids=["-".join((f"{s[0]}.{s[2]}", *s[1].values())) for s in SETTINGS])
+def test_no_number_of_the_settings_may_be_what_it_cannot_be(section, choice, name, whole, limit):
     """Every number of every section: NaN, infinity, text, true, and one step beyond each end of its range."""
-    config = presets.get("tiny")
-    now = getattr(getattr(config, section), name)
+    config = config_lib.override_all(presets.get("tiny"), choice)
+    now = getattr(_below(config, section), name)
     if now == ():
         now = (1.0,)
     like = lambda value: (value,) * len(now) if isinstance(now, tuple) else value
@@ -73,11 +173,11 @@ def test_no_number_of_the_settings_may_be_what_it_cannot_be(section, name, whole
             config_lib.override(config, f"{section}.{name}", value)
     if not whole and not isinstance(now, tuple):
         with pytest.raises(limits.RangeError, match=rf"{name} is nan; it must be "):
-            dataclasses.replace(getattr(config, section), **{name: math.nan})
+            dataclasses.replace(_below(config, section), **{name: math.nan})
 
 
 def test_every_weight_rate_and_probability_has_a_range():
-    unlimited = {name for section, name, _, limit in SETTINGS if limit == limits.FINITE}
+    unlimited = {name for _, _, name, _, limit in SETTINGS if limit == limits.FINITE}
     assert unlimited == set()
 
 
@@ -89,7 +189,7 @@ def test_geometry_says_what_is_wrong_in_its_own_words():
 
 
 def test_a_kept_run_that_says_nothing_of_steps_goes_on_taking_the_first_action():
-    kept = presets.get("town").to_dict()
+    kept = json.loads((KEPT / "town-tr.json").read_text())
     assert kept["contract"].pop("step_action") == "mean"
     assert config_lib.Config.from_dict(kept).contract.step_action == "first"
     assert config_lib.Config.from_dict({"preset": "mine"}).contract.step_action == "mean"

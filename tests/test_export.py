@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from muvo_jax import config as config_lib
 from muvo_jax import export, presets
 from muvo_jax.model import live, rollout, world_model
 
@@ -36,8 +37,8 @@ np.savez(folder / "out.npz", frame=seen["frame"], **dream, action=call("decode_a
 
 
 # One that remembers what was seen takes its memory along, as arrays among the others.
-REMEMBERING = {"first_guess": "last_seen", "action_path": "recurrence", "memory_frames": 2,
-               "guided_channels": (8, 8, 8), "route": False}
+REMEMBERING = {"first_guess": config_lib.LastSeen(memory_frames=2, guided_channels=(8, 8, 8)),
+               "action_path": "recurrence", "route": False}
 
 
 @pytest.mark.parametrize(("heads", "changes"), [(("action",), {}), (("image", "occupancy", "action"), REMEMBERING)])

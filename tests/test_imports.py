@@ -10,17 +10,13 @@ import pytest
 import muvo_jax
 
 PACKAGE = pathlib.Path(muvo_jax.__file__).parent
-BASE = {"types", "config", "config_augmentation", "config_heads", "config_json", "geometry", "limits",
-        "ops", "head"}
+BASE = {"types", "config", "geometry", "limits", "ops", "head"}
 ALLOWED = {
     "types": set(),
     "limits": set(),
-    "config_augmentation": {"limits"},
-    "config_heads": {"limits"},
-    "config_json": {"limits"},
     "geometry": {"limits"},
     "late": set(),
-    "config": {"config_augmentation", "config_heads", "config_json", "geometry", "limits"},
+    "config": {"geometry", "limits"},
     "presets": {"config"},
     "ops": {"types", "config", "geometry"},
     "head": {"types", "config"},
@@ -44,10 +40,11 @@ RECORDED = {"errors", "fields", "words", "schema", "sequences", "files", "descri
 ALLOWED_IN_DATA = dict.fromkeys(RECORDED, RECORDED) | {
     "plain": RECORDED,
     "kitti": RECORDED,
+    "nuscenes": RECORDED,
     "muvo": RECORDED | {"plain"},  # its exporter reads the plain format
     "carla": RECORDED | {"plain", "muvo"},
     "packed": RECORDED | {"sources"},  # its writer reads any format
-    "sources": RECORDED | {"plain", "kitti", "muvo", "packed"},
+    "sources": RECORDED | {"plain", "kitti", "nuscenes", "muvo", "packed"},
     "voxelizing": RECORDED | {"plain", "muvo"},
     "prepare": RECORDED,
     "windows": RECORDED | {"prepare"},

@@ -43,7 +43,7 @@ def fast_compilation():
 
 def test_the_cases_have_every_pair():
     parts = [(*variant.lower().split("-"), latent) for variant, latent in [*CASES, ("RV-WOB-TR", "1d")]]
-    axes = (config_lib.LIDAR_ENCODERS, config_lib.CAMERA_ENCODERS, config_lib.FUSIONS, config_lib.LATENTS)
+    axes = (config_lib.LIDARS, config_lib.CAMERAS, config_lib.FUSIONS, config_lib.LATENTS)
     for first, second in itertools.combinations(range(len(axes)), 2):
         # Only transformer fusion leaves tokens for the 2D latent.
         wanted = {(a, b) for a in axes[first] for b in axes[second] if not (b == "2d" and a in ("fc", "avg"))}

@@ -36,7 +36,7 @@ def leaky_slope() -> tuple[str, str]:
     """Mean absolute size of imagined deterministic states after six steps, with the same fresh weights."""
     sizes = []
     for numerics in ("standard", "reference"):
-        config = dataclasses.replace(presets.get("town").model, latent="1d", numerics=numerics)
+        config = config_lib.override_all(presets.get("town"), {"model.latent": "1d", "model.numerics": numerics}).model
         model = world_model.WorldModel(config)
         variables = model.init(jax.random.key(0))
         dream = rollout.imagine(model, variables, jax.random.key(1), model.initial_state(8), jnp.ones((8, 6, 2)))
@@ -127,11 +127,11 @@ def posterior_memory() -> tuple[str, str]:
     """Mean change of the posterior's means where the mark of the state's tokens moves by N(0, 0.5), 2D town model."""
     changes = []
     for numerics in ("standard", "reference"):
-        config = dataclasses.replace(presets.get("town").model, latent="2d", numerics=numerics)
+        config = dataclasses.replace(presets.get("town").model, numerics=numerics)
         model = world_model.WorldModel(config)
         params = model.init(jax.random.key(0))["params"]
-        mark = 0.5 * jax.random.normal(jax.random.key(1), (config.token_channels,))
-        embedding = jax.random.normal(jax.random.key(2), (4, 50, config.token_channels))
+        mark = 0.5 * jax.random.normal(jax.random.key(1), (config.fusion.token_channels,))
+        embedding = jax.random.normal(jax.random.key(2), (4, 50, config.fusion.token_channels))
         zeros = model.initial_state(4).stochastic
         noise = types.StepNoise(zeros, zeros, jnp.zeros((4,), bool))
 
@@ -149,7 +149,8 @@ def decoder_parameters() -> tuple[str, str]:
     """Parameters of the 2D model's decoders at the paper's size."""
     counts = []
     for numerics in ("standard", "reference"):
-        shapes = world_model.WorldModel(config_lib.ModelConfig(latent="2d", numerics=numerics)).variable_shapes()
+        config = config_lib.ModelConfig(latent=config_lib.TokenLatent(), numerics=numerics)
+        shapes = world_model.WorldModel(config).variable_shapes()
         decoders = [shape for name, shape in shapes["params"].items() if name.startswith("decoders_")]
         counts.append(f"{sum(leaf.size for leaf in jax.tree.leaves(decoders)):,}")
     return counts[0], counts[1]

@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import muvo_jax
+from muvo_jax import config as config_lib
 from muvo_jax import presets
 from muvo_jax.model import glimpse
 from muvo_jax.ops import camera, range_view
@@ -72,7 +73,7 @@ def measure(config) -> dict[str, float]:
 if __name__ == "__main__":
     with_memory = presets.get("town")
     without = dataclasses.replace(with_memory, model=dataclasses.replace(
-        with_memory.model, first_guess="training_mean", follow_movers=False))
+        with_memory.model, first_guess=config_lib.TrainingMean()))
     with_s, without_s = measure(with_memory), measure(without)
     for name, value in with_s.items():
         ratio = value / without_s[name]

@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import muvo_jax
+from muvo_jax import config as config_lib
 from muvo_jax.data import pipeline, sources
 from muvo_jax.metrics import occupancy
 from muvo_jax.model import glimpse
@@ -37,12 +38,13 @@ def sights(run, batch: Batch):
 def voxels(run, batch: Batch) -> dict[str, jax.Array]:
     """Rule -> occupied, bool [N, X, Y, Z]."""
     config = run.model.config
+    places = config_lib.as_kind(config.first_guess, config_lib.LastSeen).memory_frames
     memory, rows, vantage = sights(run, batch)
     shown = glimpse.look(config, memory, rows, vantage, ("occupancy",))[0]["occupancy"]
     priority = lambda newest, older: newest + (1.0 - jnp.abs(newest)) * older
     first = priority(shown.newest, shown.older)
-    memory_frames = memory.pose.shape[1] + jnp.arange(-config.memory_frames, 0)
-    index = jnp.broadcast_to(jnp.maximum(memory_frames, 0)[None], (rows.shape[0], config.memory_frames))
+    memory_frames = memory.pose.shape[1] + jnp.arange(-places, 0)
+    index = jnp.broadcast_to(jnp.maximum(memory_frames, 0)[None], (rows.shape[0], places))
     pose = motion.relative(jnp.broadcast_to(vantage.motion.pose[:, None], (*index.shape, 3)),
                            memory.pose[rows[:, None], index])
     view = config.range_view
@@ -50,7 +52,7 @@ def voxels(run, batch: Batch) -> dict[str, jax.Array]:
                                     (rows[:, None] * memory.pose.shape[1] + index).reshape(-1), pose.reshape(-1, 3),
                                     config.voxels, view).reshape(*index.shape, *config.voxels.shape)
     beams = jnp.where((memory_frames >= 0).reshape(1, -1, 1, 1, 1), beams, 0.0)
-    fading = glimpse.FADE ** jnp.arange(config.memory_frames - 2, -1, -1).reshape(1, -1, 1, 1, 1)
+    fading = glimpse.FADE ** jnp.arange(places - 2, -1, -1).reshape(1, -1, 1, 1, 1)
     rules = {"beams through the voxels' centres alone": priority(beams[:, -1], (beams[:, :-1] * fading).sum(axis=1)),
              "and voxels that hold a return, all scans added up": shown.newest + shown.older,
              "the newest scan first": first}

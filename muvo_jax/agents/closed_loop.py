@@ -150,7 +150,8 @@ def drive(simulator: Simulator, driver: Driver, key: Array, seed: int, steps: in
 
 def planning_driver(simulator: Simulator, environment: environment_lib.Environment, variables: Variables,
                     planner: str = "cem", config: planners.PlannerConfig = planners.PlannerConfig(), *,
-                    horizon: int = 10, temperature: float = 0.0, discount: float = 0.98) -> Driver:
+                    horizon: int = 10, temperature: float = 0.0, discount: float = 0.98,
+                    shared_future: bool | None = None) -> Driver:
     """Drives by planning in imagination at every step, from the last plan shifted; compiled once.
 
     Args:
@@ -161,12 +162,16 @@ def planning_driver(simulator: Simulator, environment: environment_lib.Environme
       horizon: steps to plan.
       temperature: factor on the latent noise in imagination; 0 plans on the mean future.
       discount: of the planned return.
+      shared_future: imagine one future for all plans of an iteration (planners.shared_future_returns) or one for each
+        (planners.imagined_returns); None shares it wherever the environment allows.
 
     Raises:
       ValueError: for an unknown planner, a horizon below 1, or a simulator that steps at another rate than the model.
     """
     if planner not in planners.PLANNERS:
         raise ValueError(f"planner {planner!r} is unknown; known are {', '.join(planners.PLANNERS)}.")
+    if shared_future is None:
+        shared_future = environment.shares_future
     if horizon < 1:
         raise ValueError(f"planning_driver: horizon is {horizon}; it must be at least 1.")
     if abs(simulator.step_s - environment.step_s) > 1e-6:
@@ -180,16 +185,16 @@ def planning_driver(simulator: Simulator, environment: environment_lib.Environme
                                 jnp.float32(0))
         observation = {name: np.asarray(value)[None] for name, value in simulator.observe(state).items()}
         memory = plan_step(environment, planner, config, variables, key_plan, memory, observation, previous[None],
-                           jnp.float32(temperature), discount)
+                           jnp.float32(temperature), discount, shared_future)
         return memory, np.asarray(memory.plan[0])
 
     return driver
 
 
-@functools.partial(jax.jit, static_argnames=("environment", "planner", "config", "discount"))
+@functools.partial(jax.jit, static_argnames=("environment", "planner", "config", "discount", "shared_future"))
 def plan_step(environment: environment_lib.Environment, planner: str, config: planners.PlannerConfig,
               variables: Variables, key: Array, memory: PlanMemory, observation: Mapping[str, Array],
-              previous_action: Array, temperature: Array, discount: float) -> PlanMemory:
+              previous_action: Array, temperature: Array, discount: float, shared_future: bool) -> PlanMemory:
     """Filters one observation (each field [1, ...]) and plans from there on. The latents are means, not samples."""
     filtered = live.observe_step(environment.model, variables, memory.live, observation, previous_action,
                                  sampled=False)
@@ -201,7 +206,8 @@ def plan_step(environment: environment_lib.Environment, planner: str, config: pl
     params = dataclasses.replace(environment.params(variables, bank, horizon), temperature=temperature)
     state = environment_lib.EnvState(filtered.latent[0], motion_ops.at_rest_of_frame(speed_mps[0]), jnp.int32(0),
                                      jnp.int32(0), jnp.float32(0), jnp.bool_(False))
-    objective = planners.imagined_returns(environment, params, state, discount=discount)
+    returns = planners.shared_future_returns if shared_future else planners.imagined_returns
+    objective = returns(environment, params, state, discount=discount)
     plan = planners.PLANNERS[planner](objective, key, planners.shift(memory.plan), config)
     return PlanMemory(filtered, plan.actions, plan.value)
 

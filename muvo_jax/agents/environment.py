@@ -19,6 +19,7 @@ import jax.numpy as jnp
 from muvo_jax import config as config_lib
 from muvo_jax import run as run_lib
 from muvo_jax.agents import forks, rewards
+from muvo_jax.agents import route as route_lib
 from muvo_jax.model import checks
 from muvo_jax.model import memory as memory_lib
 from muvo_jax.model.world_model import WorldModel
@@ -61,12 +62,16 @@ class EnvParams:
       bank: start states.
       max_steps_in_episode: int32, the horizon at which an episode is truncated.
       temperature: factor on the latent noise; 0 makes the world deterministic.
+      routes: Route [M, ...], the line on each start's route map, or None where there are no maps.
+      seen: float32 [M, X, Y], obstacles that each start's own scan showed (rewards.seen_plan), or None without memory.
     """
 
     variables: Variables
     bank: StartBank
     max_steps_in_episode: Array
     temperature: Array
+    routes: route_lib.Route | None = None
+    seen: Array | None = None
 
 
 @flax.struct.dataclass
@@ -141,6 +146,9 @@ class Environment:
             raise ValueError(f"Environment: the driving reward needs the ego path, contract.kinematics is "
                              f"{self.contract.kinematics!r}, and this run trained no head ego_motion. Train it "
                              f"(--with-heads=ego_motion), or pass a reward_function of your own.")
+        if self._tests_collisions:
+            grid, scale = self.model.config.voxels, self.reward_config.occupancy_scale
+            rewards.obstacle_layers(grid.shape[2] // scale, grid, self.reward_config.box, pooled=self.pooled)
 
     @classmethod
     def of_run(cls, run: run_lib.Run, *, learned_reward: bool = False, **options: Any) -> Environment:
@@ -164,6 +172,16 @@ class Environment:
         return "ego_motion" if "ego_motion" in self.model.config.heads else None
 
     @property
+    def shares_future(self) -> bool:
+        """Whether a plan can be judged in the future of another one: path and reward need no latents of its own."""
+        return self.reward_function is None and self.ego_path == "bicycle"
+
+    @property
+    def pooled(self) -> bool:
+        """Whether coarse occupancy was trained on pooled labels; see rewards.centres_m."""
+        return self.model.config.numerics == "standard"
+
+    @property
     def step_s(self) -> float:
         """Seconds of one step."""
         return self.periods / self.contract.rate_hz
@@ -176,10 +194,14 @@ class Environment:
         return tuple(dict.fromkeys((*wanted, *self._reward_heads, *path)))
 
     @property
+    def _tests_collisions(self) -> bool:
+        return self.reward_function is None and self.reward_config.collision > 0
+
+    @property
     def _reward_heads(self) -> tuple[str, ...]:
         if self.reward_heads is not None:
             return self.reward_heads
-        return ("occupancy",) if self.reward_function is None and self.reward_config.collision else ()
+        return ("occupancy",) if self._tests_collisions else ()
 
     @property
     def observation_shapes(self) -> Any:
@@ -232,7 +254,13 @@ class Environment:
         if not set(guessed).isdisjoint(self.decoded_heads) and (bank.memory is None or bank.row is None):
             raise ValueError(f"StartBank: it has no memory, but the heads {', '.join(guessed)} of this model look at "
                              f"what was seen of late; make it of what `observe` returned (Environment.starts).")
-        return EnvParams(jax.tree.map(jnp.asarray, variables), bank, jnp.int32(horizon), jnp.float32(temperature))
+        routes = None if bank.route_map is None else _follow(jnp.asarray(bank.route_map), self.reward_config.route)
+        seen, vantage = None, bank.latent.vantage
+        if self._tests_collisions and bank.memory is not None and bank.row is not None and vantage is not None:
+            seen = _seen(bank.memory.range_view, bank.row, vantage.last, self.model.config.voxels,
+                         self.reward_config.box)
+        return EnvParams(jax.tree.map(jnp.asarray, variables), bank, jnp.int32(horizon), jnp.float32(temperature),
+                         routes, seen)
 
     def reset(self, key: Array, params: EnvParams) -> tuple[Any, EnvState]:
         """Draws a start from the bank: (observation, state)."""
@@ -264,7 +292,8 @@ class Environment:
         elif self.ego_path == "ego_motion":
             motion = motion_ops.moved(motion, full["ego_motion"])
         route_map = None if params.bank.route_map is None else params.bank.route_map[state.start]
-        moment = rewards.Moment(state.motion, motion, action, latent.features, for_reward, route_map)
+        moment = rewards.Moment(state.motion, motion, action, latent.features, for_reward, route_map,
+                                route_of(params, state), self.seen_ahead(params, state, after_steps=state.time + 1))
         reward, terminated, terms = self._reward(moment)
         after = EnvState(latent, motion, state.start, state.time + 1, reward, terminated)
         truncated = after.time >= params.max_steps_in_episode
@@ -277,11 +306,35 @@ class Environment:
         choose = lambda new, old: jnp.where(final, new, old)
         return jax.tree.map(choose, fresh, state), jax.tree.map(choose, fresh_observation, observation)
 
+    def occupancy_ahead(self, params: EnvParams, key: Array, state: EnvState, plan: Array) -> Array:
+        """Occupancy logits [H, X, Y, Z, 2] at the reward's scale after each step of a plan [H, 2], in the frame of the
+        car of that moment. The noise is that of `play` under the same key."""
+        keys = jax.vmap(lambda key: jax.random.split(key)[1])(jax.random.split(key, plan.shape[0]))
+
+        def step(latent, inputs):
+            key, action = inputs
+            noise = params.temperature * jax.random.normal(key, latent.stochastic.shape, jnp.float32)
+            batched = jax.tree.map(lambda leaf: jnp.expand_dims(leaf, 0), (noise, latent, self._checked(action)))
+            latent = self.model.imagine_step(params.variables, *batched)[0][0]
+            return latent, latent
+
+        _, latents = jax.lax.scan(step, state.latent, (keys, plan))
+        return self._decode(params.variables, params.bank, latents, jnp.broadcast_to(state.start, plan.shape[:1]),
+                            ("occupancy",))[1]["occupancy"]
+
+    def seen_ahead(self, params: EnvParams, state: EnvState, after_steps: Array) -> Array | None:
+        """What was seen at the start and counts `after_steps` [*L] steps later: [*L, X, Y]; None without memory."""
+        if params.seen is None:
+            return None
+        holds = after_steps * self.step_s <= self.reward_config.seen_s + 1e-6
+        return jnp.where(jnp.expand_dims(holds, (-2, -1)), jnp.broadcast_to(
+            params.seen[state.start], (*jnp.shape(after_steps), *params.seen.shape[1:])), 0.0)
+
     def _reward(self, moment: rewards.Moment) -> tuple[Array, Array, dict[str, Array]]:
         if self.reward_function is not None:
             return self.reward_function(moment)
         return rewards.driving_reward(moment, grid=self.model.config.voxels, contract=self.contract, step_s=self.step_s,
-                                      config=self.reward_config)
+                                      config=self.reward_config, pooled=self.pooled)
 
     def _decode(self, variables: Variables, bank: StartBank, latent: LatentState, start: Array,
                 heads: tuple[str, ...] | None = None):
@@ -302,6 +355,21 @@ class Environment:
 
     def _checked(self, action: Array) -> Array:
         return jnp.clip(checks.one_action(action, (), "Environment.step"), -1.0, 1.0)
+
+
+@functools.partial(jax.jit, static_argnames=("scale",))
+def _follow(route_maps, scale):
+    return jax.vmap(lambda route_map: route_lib.follow(route_map, scale))(route_maps)
+
+
+@functools.partial(jax.jit, static_argnames=("grid", "box"))
+def _seen(scans, row, last, grid, box):
+    return jax.lax.map(lambda which: rewards.seen_plan(scans[which[0], which[1]], grid, box), (row, last))
+
+
+def route_of(params: EnvParams, state: EnvState) -> route_lib.Route | None:
+    """The route of a state's start, or None."""
+    return None if params.routes is None else jax.tree.map(lambda leaf: leaf[state.start], params.routes)
 
 
 def play(environment: Environment, params: EnvParams, key: Array, state: EnvState, driver: Any,

@@ -16,8 +16,10 @@ import jax.numpy as jnp
 import optax
 
 from muvo_jax.agents import environment as environment_lib
+from muvo_jax.agents import rewards
 from muvo_jax.limits import COUNT, NOT_NEGATIVE, SHARE, above, check
 from muvo_jax.model import checks
+from muvo_jax.ops import motion as motion_ops
 from muvo_jax.ops import precision
 from muvo_jax.types import Array
 
@@ -157,14 +159,70 @@ def imagined_returns(environment: environment_lib.Environment, params: environme
 
         def one(key, plan):
             _, transitions = environment_lib.play(environment, params, key, state, plan, horizon)
-            alive = 1.0 - transitions.terminated.astype(jnp.float32)
-            before = jnp.concatenate([jnp.ones(1, jnp.float32), jnp.cumprod(alive)[:-1]])
-            return (discount ** jnp.arange(horizon, dtype=jnp.float32) * before * transitions.reward).sum()
+            return _discounted(transitions.reward, transitions.terminated, discount)
 
         keys = jax.random.split(key, noises)
         return jax.vmap(lambda plan: jax.vmap(one, (0, None))(keys, plan).mean())(plans)
 
     return returns
+
+
+def shared_future_returns(environment: environment_lib.Environment, params: environment_lib.EnvParams,
+                          state: environment_lib.EnvState, *, discount: float = 0.98) -> Objective:
+    """As imagined_returns, but one future is imagined for all plans: that of the first (CEM's and MPPI's mean).
+
+    Every plan drives through the occupancy that was predicted along it, on the path of the contract's bicycle: the
+    others on the road are taken to do the same whatever the car does. Of P plans one is imagined and decoded instead of
+    all; for that one the returns are those of imagined_returns.
+
+    Raises:
+      ValueError: for a reward or a path that need each plan's own latents (Environment.shares_future).
+    """
+    if not environment.shares_future:
+        raise ValueError(f"shared_future_returns: the reward is a function of its own or the path is that of "
+                         f"{environment.ego_path!r}, which need each plan's own future; use imagined_returns.")
+
+    def returns(key, plans):
+        count = plans.shape[0]
+        start = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (count, 1, *leaf.shape)), state.motion)
+        after = motion_ops.path(jax.tree.map(lambda leaf: leaf[:, 0], start), plans, environment.contract,
+                                environment.periods)
+        before = jax.tree.map(lambda first, path: jnp.concatenate([first, path[:, :-1]], axis=1), start, after)
+        touched = None
+        if environment.reward_config.collision:
+            touched = _touched(environment, params, jax.random.split(key, 1)[0], state, plans[0], before, after)
+        moment = rewards.Moment(before, after, plans, state.latent.features, {},
+                                route=environment_lib.route_of(params, state))
+        reward, terminated, _ = rewards.weighed(moment, touched, contract=environment.contract,
+                                                step_s=environment.step_s, config=environment.reward_config)
+        return jax.vmap(lambda reward, ended: _discounted(reward, ended, discount))(reward, terminated)
+
+    return returns
+
+
+def _touched(environment, params, key, state, shared, before, after):
+    """Collision probabilities [P, H] of the motions [P, H] in what is imagined under the plan `shared`, the first."""
+    config, grid, pooled = environment.reward_config, environment.model.config.voxels, environment.pooled
+    count, horizon = after.speed_mps.shape
+
+    def under(obstacles, pose, pooled=True):
+        poses = jnp.swapaxes(rewards.poses_ahead(pose, before, after, config.ahead_s), 0, 1)  # [H, P, N, 3]
+        found = rewards.box_collision(obstacles, poses.reshape(horizon, -1, 3), grid, config.box, pooled=pooled)
+        return found.reshape(horizon, count, -1).max(axis=-1).T
+
+    # The others' gradients see the future as it is: it moves with the shared plan, not with theirs.
+    occupancy = environment.occupancy_ahead(params, key, state, jax.lax.stop_gradient(shared))
+    imagined = rewards.obstacle_plan(occupancy, grid, config.box, pooled=pooled)
+    touched = under(imagined, motion_ops.relative(after.pose, jax.lax.stop_gradient(after.pose[:1])), pooled)
+    seen = environment.seen_ahead(params, state, state.time + 1 + jnp.arange(horizon))
+    return touched if seen is None else jnp.maximum(touched, under(seen, after.pose))
+
+
+def _discounted(reward: Array, terminated: Array, discount: float) -> Array:
+    """The return of rewards [H]; after the step that terminates nothing more is earned."""
+    alive = 1.0 - terminated.astype(jnp.float32)
+    before = jnp.concatenate([jnp.ones(1, jnp.float32), jnp.cumprod(alive)[:-1]])
+    return (discount ** jnp.arange(reward.shape[0], dtype=jnp.float32) * before * reward).sum()
 
 
 def shift(plan: Array) -> Array:

@@ -1,8 +1,43 @@
-"""The car's motion from frame to frame, what the head ego_motion learns: from poses, recorded or dead-reckoned."""
+"""The car's motion from frame to frame, what the head ego_motion learns, from poses, recorded or dead-reckoned; and the
+actions of recordings that have the motion alone.
+"""
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
+
+from muvo_jax import config as config_lib
+
+
+def derive_action(speed_mps: float, acceleration_mps2: float, yaw_rate_radps: float,
+                  contract: config_lib.ActionContract) -> np.ndarray:
+    """The action (float32 [2]) that a bicycle model would need to move like this; yaw rate > 0 turns left."""
+    full_mps2 = contract.accel_full_mps2 if acceleration_mps2 >= 0 else contract.brake_full_mps2
+    steering_rad = -math.atan(contract.wheelbase_m * yaw_rate_radps / max(speed_mps, 1.0))
+    return np.clip(np.array([acceleration_mps2 / full_mps2, steering_rad / contract.steer_full_rad]),
+                   -1.0, 1.0).astype(np.float32)
+
+
+def of_poses(pose: np.ndarray, timestamps_s: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """How the car moved, from where it was.
+
+    Args:
+      pose: float64 [F, 3], x, y (m) and yaw (rad) in any frame that stands still.
+      timestamps_s: float64 [F], increasing.
+
+    Returns:
+      Three float64 [F]: forward speed at each frame (m/s, over both neighbours); its change (m/s2) and the turn to the
+      left (rad/s) from there to the next frame. The last frame has those of the one before; a single frame has zeros.
+    """
+    if len(pose) < 2:
+        return np.zeros(len(pose)), np.zeros(len(pose)), np.zeros(len(pose))
+    steps_s, yaw_rad = np.diff(timestamps_s), np.unwrap(pose[:, 2])
+    x_mps, y_mps = (np.gradient(pose[:, axis], timestamps_s, edge_order=2 if len(pose) > 2 else 1) for axis in (0, 1))
+    speed_mps = x_mps * np.cos(yaw_rad) + y_mps * np.sin(yaw_rad)
+    to_next = lambda values: np.append(change := np.diff(values) / steps_s, change[-1])
+    return speed_mps, to_next(speed_mps), to_next(yaw_rad)
 
 
 def dead_reckoned(speed_mps: np.ndarray, yaw_rate_radps: np.ndarray, rate_hz: float) -> np.ndarray:

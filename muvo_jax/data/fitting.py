@@ -73,7 +73,7 @@ def check_targets(config: config_lib.Config, description: schema.RecordingDescri
 def _columns(model: config_lib.ModelConfig, lidar: config_lib.RangeViewGeometry) -> int:
     """The model's columns, doubled until a pixel of its memory holds one of at most eight returns."""
     columns = model.range_view.columns
-    while model.first_guess == "last_seen" and lidar.columns > 8 * columns:
+    while isinstance(model.first_guess, config_lib.LastSeen) and lidar.columns > 8 * columns:
         columns *= 2
     return columns
 
@@ -96,10 +96,8 @@ def _fit_model(model: config_lib.ModelConfig, description: schema.RecordingDescr
                          f"{lidar.columns}, and a pixel holds one return.")
     if description.voxels is not None and "occupancy" in heads:
         changes["voxels"] = description.voxels
-        changes["occupancy_blocks"] = _occupancy_blocks(model.occupancy_blocks, description.voxels)
-        if changes["occupancy_blocks"] != model.occupancy_blocks:
-            notes.append(f"the voxel decoder has {changes['occupancy_blocks']} full-width stages instead of "
-                         f"{model.occupancy_blocks}: the recorded grid is only {_by(description.voxels.shape)}.")
+        if isinstance(model.latent, config_lib.VectorLatent):
+            changes["latent"] = _fit_voxel_decoder(model.latent, description.voxels, notes)
     elif "occupancy" in heads:
         notes.append("no occupancy is recorded: the target is what each lidar scan hit and looked through, unknown "
                      "elsewhere.")
@@ -124,10 +122,10 @@ def _fit_first_guess(model: config_lib.ModelConfig, description: schema.Recordin
     Raises:
       DataError: where the user asked for the memory.
     """
-    if model.first_guess != "last_seen":
+    if not isinstance(model.first_guess, config_lib.LastSeen):
         return model
     reason = ""
-    if model.lidar == config_lib.NO_SENSOR:
+    if model.lidar is None:
         reason = "there are no lidar scans, and nothing moves without ranges"
     elif description.contract.kinematics == "bicycle":
         if "speed_mps" not in description.modalities:
@@ -137,11 +135,11 @@ def _fit_first_guess(model: config_lib.ModelConfig, description: schema.Recordin
                   "learns it from recorded poses")
     if not reason:
         return model
-    if "model.first_guess" in keep:
+    if any(name.startswith("model.first_guess") for name in keep):
         raise schema.DataError(f"model.first_guess=last_seen with recording {description.name!r}: {reason}. Choose "
                                f"model.first_guess=training_mean otherwise.")
     notes.append(f"what was last seen is not moved, because {reason}: decoders start from the training mean.")
-    return dataclasses.replace(model, first_guess="training_mean")
+    return dataclasses.replace(model, first_guess=config_lib.TrainingMean())
 
 
 def _without_what_lacks(model: config_lib.ModelConfig, description: schema.RecordingDescription,
@@ -168,12 +166,12 @@ def _without_what_lacks(model: config_lib.ModelConfig, description: schema.Recor
         notes.append(f"no {'images are' if sensor == 'camera' else 'lidar scans are'} recorded: the model has no "
                      f"{sensor} input{which}.")
     kept = tuple(head for head in model.heads if head not in heads)
-    seen = {sensor for sensor in ("camera", "lidar") if getattr(model, sensor) != config_lib.NO_SENSOR} - missing
+    seen = {sensor for sensor in ("camera", "lidar") if getattr(model, sensor) is not None} - missing
     if not seen or not kept:
         raise schema.DataError(f"recording {description.name!r} lacks {', '.join(sorted(missing))}: nothing is left to "
-                               f"{'see' if not seen else 'predict'} for a model with camera {model.camera}, lidar "
-                               f"{model.lidar} and heads {', '.join(model.heads)}. Choose other ones.")
-    changes: dict = dict.fromkeys(missing, config_lib.NO_SENSOR)
+                               f"{'see' if not seen else 'predict'} for the model {model.variant} with the heads "
+                               f"{', '.join(model.heads)}. Choose other ones.")
+    changes: dict = dict.fromkeys(missing)
     return dataclasses.replace(model, heads=kept, **changes)
 
 
@@ -185,11 +183,15 @@ def _image_size(camera: schema.Camera, columns: int) -> tuple[int, int]:
     return rows // _SIDE_MULTIPLE * _SIDE_MULTIPLE, columns
 
 
-def _occupancy_blocks(wanted: int, grid: config_lib.VoxelGrid) -> int:
-    """The most full-width decoder stages, up to `wanted`, that halve down to whole voxels."""
-    for blocks in range(wanted, -1, -1):
+def _fit_voxel_decoder(latent: config_lib.VectorLatent, grid: config_lib.VoxelGrid,
+                       notes: list[str]) -> config_lib.VectorLatent:
+    """With the most full-width decoder stages, up to those it has, that halve down to whole voxels."""
+    for blocks in range(latent.occupancy_blocks, -1, -1):
         if all(side % 2 ** (blocks + 3) == 0 for side in grid.shape):
-            return blocks
+            if blocks != latent.occupancy_blocks:
+                notes.append(f"the voxel decoder has {blocks} full-width stages instead of {latent.occupancy_blocks}: "
+                             f"the recorded grid is only {_by(grid.shape)}.")
+            return dataclasses.replace(latent, occupancy_blocks=blocks)
     raise schema.DataError(f"the recorded voxel grid of {_by(grid.shape)} does not suit the voxel decoder: each "
                            f"side must be a multiple of 8. Record another grid, or leave the occupancy head out.")
 

@@ -51,18 +51,18 @@ def prepare_frame(raw: schema.RawFrame, config: config_lib.Config) -> PreparedFr
                                f"Choose windows of sequences that have it (schema.Sequence.has).")
     ready: PreparedFrame = {name: raw[name] for name in ("action", "timestamp_s", "frame_id")}
     try:
-        if model.camera != config_lib.NO_SENSOR or "image" in targets:
+        if model.camera is not None or "image" in targets:
             ready["image"], ready["intrinsics"] = camera_ops.resize_crop(raw["image"], raw["intrinsics"],
                                                                          model.image_size)
             ready["camera_to_ego"] = raw["camera_to_ego"]
-        if model.lidar != config_lib.NO_SENSOR or "range_view" in targets:
+        if model.lidar is not None or "range_view" in targets:
             ready["range_view"] = range_view_ops.project(raw["points_m"], model.range_view)
         if "occupancy" in targets:
             ready["occupancy"] = _occupancy(raw, model)
     except ValueError as error:
         raise schema.DataError(f"frame {int(raw['frame_id'])}: {error}") from error
-    if model.lidar == "pp":
-        ready["points"], ready["point_count"] = padded_points(raw["points_m"], model.pillars.points,
+    if isinstance(model.lidar, config_lib.PillarLidar):
+        ready["points"], ready["point_count"] = padded_points(raw["points_m"], model.lidar.grid.points,
                                                                int(raw["frame_id"]))
     if model.navigation:
         ready |= {name: raw[name] for name in NAVIGATION}  # type: ignore[literal-required]
@@ -114,9 +114,9 @@ def needed(config: config_lib.Config, modalities: Collection[str]) -> frozenset[
     """The keys of RawFrame that `prepare_frame` must find, of a recording with these modalities."""
     model, targets = config.model, head_lib.targets(config)
     names = {"action", "timestamp_s", "frame_id"} | (recorded(targets) - _OPTIONAL)
-    if model.camera != config_lib.NO_SENSOR or "image" in targets:
+    if model.camera is not None or "image" in targets:
         names |= {"image", "intrinsics", "camera_to_ego"}
-    if model.lidar != config_lib.NO_SENSOR or "range_view" in targets:
+    if model.lidar is not None or "range_view" in targets:
         names.add("points_m")
     if "occupancy" in targets:
         names.add("occupancy" if "occupancy" in modalities else "points_m")
@@ -142,8 +142,8 @@ def padded_points(points_m: np.ndarray, rows: int, seed: int) -> tuple[np.ndarra
     Of a longer scan a random subset stays, the same one each time: its first points would be one side of the world.
     """
     if len(points_m) > rows:
-        warnings.warn(f"scans with more than model.pillars.points={rows} points are thinned to a random subset of that "
-                      f"size.", schema.DataWarning, stacklevel=2)
+        warnings.warn(f"scans with more than model.lidar.grid.points={rows} points are thinned to a random subset of "
+                      f"that size.", schema.DataWarning, stacklevel=2)
         points_m = points_m[np.random.default_rng(seed).choice(len(points_m), rows, replace=False)]
     padded = np.zeros((rows, 3), np.float32)
     padded[:len(points_m)] = points_m

@@ -7,8 +7,9 @@ model eats; pipeline.py cuts windows. Ego frame and time convention: muvo_jax.ty
 from __future__ import annotations
 
 import dataclasses
+import pathlib
 from collections.abc import Collection
-from typing import Annotated, Protocol, TypedDict
+from typing import Annotated, Protocol, TypedDict, runtime_checkable
 
 import numpy as np
 
@@ -19,7 +20,7 @@ from muvo_jax.data.fields import LABELS
 from muvo_jax.limits import RangeError, between, check
 from muvo_jax.ops import camera as camera_ops
 
-__all__ = ["INSTANCE_CLASSES", "LABELS", "Camera", "DataError", "DataWarning", "RawFrame", "Recording",
+__all__ = ["INSTANCE_CLASSES", "LABELS", "Camera", "DataError", "DataWarning", "ListsFiles", "RawFrame", "Recording",
            "RecordingDescription", "Sequence", "instance_mask"]
 
 _SIDE_PX = between(1, 100_000, "px")
@@ -223,6 +224,15 @@ class Recording(Protocol):
         Raises:
           DataError: as `read`.
         """
+        ...
+
+
+@runtime_checkable
+class ListsFiles(Protocol):
+    """A reader of a format that keeps the files of all runs together, so that it alone knows which are whose."""
+
+    def run_files(self, name: str) -> list[pathlib.Path]:
+        """Returns the files that the frames of a run are made of, in a fixed order."""
         ...
 
 

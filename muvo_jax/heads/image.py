@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from muvo_jax import head, types
-from muvo_jax.config import LossConfig, ModelConfig, VoxelGrid
+from muvo_jax.config import LastSeen, LossConfig, ModelConfig, VoxelGrid, as_kind
 from muvo_jax.metrics import baselines, image, streaming
 from muvo_jax.model import decoders, glimpse, tokens
 from muvo_jax.objectives import labels, regression, similarity
@@ -89,7 +89,8 @@ HEAD = head.Head(
     term_targets={"image_instance_mask": head.TermTarget("image_instance", lambda model: model.image_size)},
     build=lambda model: decoders.of_image(model, 3), scales=head.SCALES, tokens="image", initial_bias=0.5,
     losses=_losses, weights=_weights, average=_average,
-    guide=head.Guide(view="image", plane=lambda model: model.image_size, width=lambda model: model.guided_channels[0],
+    guide=head.Guide(view="image", plane=lambda model: model.image_size,
+                     width=lambda model: as_kind(model.first_guess, LastSeen).guided_channels[0],
                      channels=lambda model, scale: 3, shrink=tokens.IMAGE_SHRINK, see=_see, compose=_compose,
                      blurs=True),
     frames=head.Frames(

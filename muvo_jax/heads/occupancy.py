@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from muvo_jax import head, types
-from muvo_jax.config import LossConfig, ModelConfig, VoxelGrid
+from muvo_jax.config import LastSeen, LossConfig, ModelConfig, VoxelGrid, as_kind
 from muvo_jax.metrics import baselines, occupancy, streaming
 from muvo_jax.model import decoders, glimpse
 from muvo_jax.objectives import classification, labels, scal
@@ -127,7 +127,7 @@ HEAD = head.Head(
     build=lambda model: decoders.of_voxels(model, 2), scales=head.SCALES, tokens="occupancy", initial_bias=0.0,
     losses=_losses, weights=_weights, average=_average,
     guide=head.Guide(view="occupancy", plane=lambda model: model.voxels.shape[:2],
-                     width=lambda model: model.guided_channels[2],
+                     width=lambda model: as_kind(model.first_guess, LastSeen).guided_channels[2],
                      channels=lambda model, scale: 2 * model.voxels.shape[2] // scale, shrink=8, see=_see,
                      compose=_compose),
     frames=head.Frames(

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from muvo_jax import head, types
-from muvo_jax.config import LossConfig, ModelConfig, VoxelGrid
+from muvo_jax.config import LastSeen, LossConfig, ModelConfig, VoxelGrid, as_kind
 from muvo_jax.metrics import baselines, occupancy, points, streaming
 from muvo_jax.model import decoders, glimpse, tokens
 from muvo_jax.objectives import chamfer, labels, regression
@@ -130,8 +130,8 @@ HEAD = head.Head(
     build=lambda model: decoders.of_range_view(model, 4), scales=head.SCALES, tokens="range_view", finish=_finish,
     initial_bias=0.0, losses=_losses, weights=_weights, average=_average,
     guide=head.Guide(view="range_view", plane=lambda model: (model.range_view.rows, model.range_view.columns),
-                     width=lambda model: model.guided_channels[1], channels=lambda model, scale: 5,
-                     shrink=tokens.RANGE_VIEW_SHRINK, see=_see, compose=_compose),
+                     width=lambda model: as_kind(model.first_guess, LastSeen).guided_channels[1],
+                     channels=lambda model, scale: 5, shrink=tokens.RANGE_VIEW_SHRINK, see=_see, compose=_compose),
     frames=head.Frames(
         field="range_view", of=lambda value, model: value, sums=_sums, error=_error, error_name="range",
         metrics={"chamfer_m": head.Metric("all", streaming.mean, "Chamfer", "m", 3, higher=False, on_screen=True,

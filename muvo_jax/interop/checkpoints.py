@@ -113,9 +113,11 @@ def recognise(stored: Stored) -> config_lib.ModelConfig:
 
 def published_name(model: config_lib.ModelConfig) -> str | None:
     """The released file that a model of exactly this architecture is, None for others."""
-    released = dataclasses.replace(config_lib.ModelConfig(), numerics="reference", latent=model.latent,
+    released = dataclasses.replace(config_lib.ModelConfig(), numerics="reference", latent=type(model.latent)(),
                                    heads=model.heads, backbone=model.backbone)
-    return _PUBLISHED.get((model.latent, "occupancy" in model.heads, model.backbone)) if model == released else None
+    if model != released:
+        return None
+    return _PUBLISHED.get((model.latent.kind, "occupancy" in model.heads, model.backbone))
 
 
 class _Misshapen(ValueError):
@@ -132,21 +134,23 @@ def _describe(state_dict: Mapping[str, np.ndarray]) -> config_lib.ModelConfig:
 
     has = lambda prefix: any(key.startswith(prefix) for key in state_dict)
     tokens = has("rssm.prior.query_embed_image")
-    fields: dict[str, Any] = {
-        "numerics": "reference", "latent": "2d" if tokens else "1d",
-        "fusion": "tr" if has("transformer_encoder.") else "fc" if has("embedding_combine.") else "avg",
-        "camera": "bev" if has("depth_decoder.") else "wob",
-        "lidar": "pp" if has("point_pillars.") else "rv",
-        "heads": tuple(head for head, prefix in _HEAD_PREFIXES.items() if has(prefix)), "route": has("backbone_route."),
-        "navigation": has("command_encoder."), "speed": has("speed_enc.")}
-    fields |= _sensor_encoders(fields, state_dict, shape)
-    fields |= (_transformer_fusion if fields["fusion"] == "tr" else _pooled_fusion)(fields, state_dict, shape)
-    fields |= (_token_latent if tokens else _vector_latent)(fields, state_dict, shape)
+    heads = tuple(head for head, prefix in _HEAD_PREFIXES.items() if has(prefix))
+    fields: Fields = {"numerics": "reference", "heads": heads, "route": has("backbone_route."),
+                      "navigation": has("command_encoder."), "speed": has("speed_enc.")}
+    fields |= _sensor_encoders(state_dict, shape)
+    pillars = isinstance(fields["lidar"], config_lib.PillarLidar)
+    if has("transformer_encoder."):
+        fields["fusion"] = _transformer_fusion(state_dict, shape, pillars)
+        pooled: Fields = {} if tokens else {"embedding_channels": shape("features_combine.weight", 2)[0],
+                                            "fused_channels": shape("image_feature_conv.0.conv1.weight", 4)[0]}
+    else:
+        fields["fusion"], pooled = _pooled_fusion(has, shape)
+    fields |= _token_latent(heads, state_dict, shape) if tokens else _vector_latent(heads, pooled, state_dict, shape)
     return config_lib.ModelConfig(**fields)
 
 
-def _sensor_encoders(known: Fields, state_dict: Mapping[str, np.ndarray], shape: ShapeOf) -> Fields:
-    fields: Fields = {}
+def _sensor_encoders(state_dict: Mapping[str, np.ndarray], shape: ShapeOf) -> Fields:
+    fields: Fields = {"camera": config_lib.PlaneCamera(), "lidar": config_lib.RangeViewLidar()}
     if "encoder.stem.conv.weight" in state_dict:
         fields["backbone"] = "mobilevitv2_100"
         fields["backbone_width"] = shape("encoder.stages_0.0.conv3_1x1.conv.weight", 4)[0]
@@ -155,14 +159,15 @@ def _sensor_encoders(known: Fields, state_dict: Mapping[str, np.ndarray], shape:
     for key in ("speed_enc.0.weight", "gps_encoder.0.weight"):
         if key in state_dict:
             fields["measurement_channels"] = shape(key, 2)[0]
-    if known["lidar"] == "pp":
-        fields["pillars"] = config_lib.PillarGrid(channels=shape("point_pillars.point_net.net.0.weight", 2)[0])
-    if known["camera"] == "bev":
+    if any(key.startswith("point_pillars.") for key in state_dict):
+        fields["lidar"] = config_lib.PillarLidar(
+            config_lib.PillarGrid(channels=shape("point_pillars.point_net.net.0.weight", 2)[0]))
+    if any(key.startswith("depth_decoder.") for key in state_dict):
         grid = dataclasses.replace(_birds_eye_grid(state_dict.get("frustum_pooling.bev_intrinsics", np.zeros((3, 3)))),
                                    depth_bins=shape("depth.weight", 4)[0])
         if "bev_down_sample_4.0.weight" in state_dict:
             grid = dataclasses.replace(grid, hidden_channels=shape("bev_down_sample_4.0.weight", 4)[0])
-        fields["birds_eye"] = grid
+        fields["camera"] = config_lib.BirdsEyeCamera(grid)
     return fields
 
 
@@ -176,32 +181,32 @@ def _birds_eye_grid(intrinsics: np.ndarray) -> config_lib.BirdsEyeGrid:
     return config_lib.BirdsEyeGrid(cells=round(2 * middle), cell_m=round(1 / per_m, 6), cells_behind=round(behind))
 
 
-def _transformer_fusion(known: Fields, state_dict: Mapping[str, np.ndarray], shape: ShapeOf) -> Fields:
-    lidar_decoder = "point_pillar_decoder" if known["lidar"] == "pp" else "range_view_decoder"
-    fields = {"token_channels": shape("type_embedding", 4)[2],
-              "transformer_hidden_channels": shape("transformer_encoder.layers.0.linear1.weight", 2)[0],
-              "transformer_layers": _count(state_dict, "transformer_encoder.layers"),
-              "many_tokens": f"{lidar_decoder}.upsample_skip_convs.0.0.weight" in state_dict}
-    if known["latent"] == "1d":
-        fields["embedding_channels"] = shape("features_combine.weight", 2)[0]
-        fields["fused_channels"] = shape("image_feature_conv.0.conv1.weight", 4)[0]
-    return fields
+def _transformer_fusion(state_dict: Mapping[str, np.ndarray], shape: ShapeOf,
+                        pillars: bool) -> config_lib.TransformerFusion:
+    lidar_decoder = "point_pillar_decoder" if pillars else "range_view_decoder"
+    return config_lib.TransformerFusion(
+        token_channels=shape("type_embedding", 4)[2], layers=_count(state_dict, "transformer_encoder.layers"),
+        hidden_channels=shape("transformer_encoder.layers.0.linear1.weight", 2)[0],
+        many_tokens=f"{lidar_decoder}.upsample_skip_convs.0.0.weight" in state_dict)
 
 
-def _pooled_fusion(known: Fields, state_dict: Mapping[str, np.ndarray], shape: ShapeOf) -> Fields:
-    del state_dict
+def _pooled_fusion(has: Callable[[str], bool], shape: ShapeOf) -> tuple[Any, Fields]:
+    """The fusion, and what the vector latent says of its vectors."""
     pooled = shape("final_state_conv.0.conv1.weight", 4)[0]
-    fields = {"map_channels": shape("feat_decoder.conv1.0.weight", 4)[0]}
-    if known["fusion"] == "avg":  # of an exported run; the reference has no such model
-        return fields | {"embedding_channels": pooled}
-    return fields | {"embedding_channels": shape("embedding_combine.weight", 2)[0], "fused_channels": pooled}
+    map_channels = shape("feat_decoder.conv1.0.weight", 4)[0]
+    if not has("embedding_combine."):  # of an exported run; the reference has no such model
+        return config_lib.AverageFusion(map_channels), {"embedding_channels": pooled}
+    return config_lib.ConcatenationFusion(map_channels), {
+        "embedding_channels": shape("embedding_combine.weight", 2)[0], "fused_channels": pooled}
 
 
-def _vector_latent(known: Fields, state_dict: Mapping[str, np.ndarray], shape: ShapeOf) -> Fields:
-    heads = known["heads"]
-    fields: Fields = {"deterministic_channels": shape("rssm.pre_gru_net.0.weight", 2)[0],
-                      "stochastic_channels": shape("rssm.pre_gru_net.0.weight", 2)[1],
-                      "action_channels": shape("rssm.prior_action_module.0.weight", 2)[0]}
+def _vector_latent(heads: tuple[str, ...], pooled: Fields, state_dict: Mapping[str, np.ndarray],
+                   shape: ShapeOf) -> Fields:
+    """The latent and what its decoders say of the sensors."""
+    latent: Fields = pooled | {"deterministic_channels": shape("rssm.pre_gru_net.0.weight", 2)[0],
+                               "stochastic_channels": shape("rssm.pre_gru_net.0.weight", 2)[1],
+                               "action_channels": shape("rssm.prior_action_module.0.weight", 2)[0]}
+    fields: Fields = {}
     for head, name in (("image", "rgb_decoder"), ("range_view", "lidar_re")):
         if head in heads:
             fields["decoder_channels"] = shape(f"{name}.linear.0.weight", 2)[0]
@@ -211,24 +216,23 @@ def _vector_latent(known: Fields, state_dict: Mapping[str, np.ndarray], shape: S
     if "birds_eye" in heads:
         constant = shape("bev_decoder.constant_tensor", 3)
         blocks = _count(state_dict, "bev_decoder.middle_conv")
-        fields |= {"decoder_channels": constant[0], "occupancy_blocks": blocks}
+        fields["decoder_channels"], latent["occupancy_blocks"] = constant[0], blocks
         rows, columns = (side * 2 ** (blocks + 3) for side in constant[1:])
         fields["voxels"] = config_lib.VoxelGrid((rows, columns, config_lib.VoxelGrid().shape[2]))
     if "occupancy" in heads:
         constant = shape("voxel_decoder.constant_tensor", 4)
         blocks = _count(state_dict, "voxel_decoder.middle_conv")
-        fields |= {"occupancy_channels": constant[0] // 2, "occupancy_blocks": blocks}
+        fields["occupancy_channels"], latent["occupancy_blocks"] = constant[0] // 2, blocks
         fields["voxels"] = config_lib.VoxelGrid(tuple(side * 2 ** (blocks + 3) for side in constant[1:]))
-    return fields
+    return fields | {"latent": config_lib.VectorLatent(**latent)}
 
 
-def _token_latent(known: Fields, state_dict: Mapping[str, np.ndarray], shape: ShapeOf) -> Fields:
-    heads = known["heads"]
+def _token_latent(heads: tuple[str, ...], state_dict: Mapping[str, np.ndarray], shape: ShapeOf) -> Fields:
+    """The latent and what its tokens say of the sensors."""
     rows, columns = shape("rssm.prior.query_embed_lidar", 4)[2:]
     fields: Fields = {
         "image_size": tuple(32 * side for side in shape("rssm.prior.query_embed_image", 4)[2:]),
-        "range_view": config_lib.RangeViewGeometry(rows=16 * rows, columns=16 * columns),
-        "transition_layers": _count(state_dict, "rssm.prior.module.layers")}
+        "range_view": config_lib.RangeViewGeometry(rows=16 * rows, columns=16 * columns)}
     for head, name in (("image", "rgb_decoder"), ("range_view", "lidar_re"), ("birds_eye", "bev_decoder")):
         if head in heads:
             fields["decoder_channels"] = shape(f"{name}.pre_transpose_conv.0.weight", 4)[0]
@@ -238,7 +242,8 @@ def _token_latent(known: Fields, state_dict: Mapping[str, np.ndarray], shape: Sh
         fields["occupancy_channels"] = shape("voxel_decoder.pre_transpose_conv.0.weight", 5)[0] // 2
     elif "birds_eye" in heads:
         stages = _count(state_dict, "bev_decoder.pre_transpose_conv", 2)
-    fields["occupancy_token_stages"] = stages
+    fields["latent"] = config_lib.TokenLatent(transition_layers=_count(state_dict, "rssm.prior.module.layers"),
+                                              occupancy_token_stages=stages)
     fields["voxels"] = config_lib.VoxelGrid(
         tuple(side * 2 ** (stages + 3) for side in shape("rssm.prior.query_embed_voxel", 5)[2:]))
     return fields

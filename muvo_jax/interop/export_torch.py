@@ -44,7 +44,7 @@ def export(options: Options, show) -> None:
     variables = jax.tree.map(np.asarray, dict(loaded.variables))
     state_dict = names.reference_state_dict(variables, loaded.config.model)
     safetensors_file.save(options.out, state_dict, {
-        "variant": loaded.config.model.variant, "latent": loaded.config.model.latent,
+        "variant": loaded.config.model.variant, "latent": loaded.config.model.latent.kind,
         "numerics": loaded.config.model.numerics, "step": str(loaded.step)})
     show.line(f"wrote {options.out}: {len(state_dict)} tensors of {loaded.config.model.variant}, "
               f"numerics={loaded.config.model.numerics}")

@@ -252,7 +252,7 @@ def convert_state_dict(state_dict: Mapping[str, np.ndarray], model_config: Model
     """
     match = match_state_dict(state_dict, model_config)
     if problems := match.problems():
-        raise ValueError(f"The checkpoint does not fit the {model_config.variant} model ({model_config.latent}); "
+        raise ValueError(f"The checkpoint does not fit the {model_config.variant} model ({model_config.latent.kind}); "
                          f"keys {problems}. Check the heads and sizes of the model's configuration.")
 
     def value(path, leaf):

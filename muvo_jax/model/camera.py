@@ -1,7 +1,7 @@
 """Camera encoders: image -> map of features.
 
 WOB (without bird's-eye view, paper Table I) keeps the image plane, BEV lifts it to the ground ahead. Both end in
-token_channels for fusion "tr", and otherwise in map_channels.
+fusion.token_channels or fusion.map_channels.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 from flax import linen
 
+from muvo_jax import config as config_lib
 from muvo_jax.config import ModelConfig
 from muvo_jax.model import common
 from muvo_jax.nn import layers, norm, pyramid
@@ -30,7 +31,7 @@ def normalise_image(image: jax.Array) -> jax.Array:
     return (image.astype(jnp.float32) / 255.0 - mean) / std
 
 
-class PlaneCamera(linen.Module):
+class PlaneEncoder(linen.Module):
     """WOB: [N, H/32, W/32, C], or /8 for fusions without tokens and with many of them."""
 
     config: ModelConfig
@@ -48,7 +49,7 @@ class PlaneCamera(linen.Module):
         return common.neck(self.config, name="neck")(maps, mode)
 
 
-class BirdsEyeCamera(linen.Module):
+class BirdsEyeEncoder(linen.Module):
     """BEV: lift and splat; [N, cells/4, cells/4, C], or [N, cells, cells, C] without tokens and with many of them.
 
     Rows grow to the right, columns forward. Differs from the reference where its rays and cells are half a cell off:
@@ -64,7 +65,8 @@ class BirdsEyeCamera(linen.Module):
 
     @linen.compact
     def __call__(self, frames: Mapping[str, jax.Array], mode: norm.Mode) -> jax.Array:
-        config, grid, compute = self.config, self.config.birds_eye, common.compute(self.config)
+        config, compute = self.config, common.compute(self.config)
+        grid = config_lib.as_kind(config.camera, config_lib.BirdsEyeCamera).grid
         image = normalise_image(frames["image"]).astype(compute.dtype)
         maps = common.backbone(config, LEVELS, name="backbone")(image, mode)
         channels = common.map_channels(config)
@@ -79,10 +81,11 @@ class BirdsEyeCamera(linen.Module):
         cells = frustum.cell_indices(points_m, grid, truncate=quirks).reshape(count, bins, rows * columns)
         chosen = frustum.most_probable(probabilities.reshape(cells.shape), cells, grid.lifted_bins)
         lifted = frustum.lift_splat(features.reshape(count, -1, channels), *chosen, grid)
-        if config.fusion != "tr" or config.many_tokens:
+        if common.fine_maps(config):
             return lifted
         x = jax.nn.relu(layers.Conv(grid.hidden_channels, (5, 5), compute, 2, name="shrink0")(lifted))
         return layers.Conv(channels, (5, 5), compute, 2, name="shrink1")(x)
 
 
-REGISTRY: dict[str, type[PlaneCamera] | type[BirdsEyeCamera]] = {"wob": PlaneCamera, "bev": BirdsEyeCamera}
+REGISTRY: dict[type, type[PlaneEncoder] | type[BirdsEyeEncoder]] = {
+    config_lib.PlaneCamera: PlaneEncoder, config_lib.BirdsEyeCamera: BirdsEyeEncoder}

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from flax import linen
 
-from muvo_jax.config import ModelConfig
+from muvo_jax.config import ModelConfig, TokenLatent, TransformerFusion, as_kind
 from muvo_jax.nn import layers, mobilevit, pyramid, resnet
 
 _BACKBONES: dict[str, type[resnet.ResNet18] | type[mobilevit.MobileVit]] = {
@@ -18,12 +18,25 @@ def compute(config: ModelConfig) -> layers.Compute:
 
 def measurement_channels(config: ModelConfig) -> int:
     """Channels of an encoded measurement: a token's where it becomes one."""
-    return config.token_channels if config.latent == "2d" else config.measurement_channels
+    if isinstance(config.latent, TokenLatent):
+        return token_fusion(config).token_channels
+    return config.measurement_channels
 
 
 def map_channels(config: ModelConfig) -> int:
     """Channels of the sensors' maps as fusion takes them."""
-    return config.token_channels if config.fusion == "tr" else config.map_channels
+    fusion = config.fusion
+    return fusion.token_channels if isinstance(fusion, TransformerFusion) else fusion.map_channels
+
+
+def token_fusion(config: ModelConfig) -> TransformerFusion:
+    """The fusion of a model that has tokens: every model with the 2D latent, and some others."""
+    return as_kind(config.fusion, TransformerFusion)
+
+
+def fine_maps(config: ModelConfig) -> bool:
+    """Whether fusion takes the sensors' finest maps: where it has no tokens, or many of them."""
+    return not isinstance(config.fusion, TransformerFusion) or config.fusion.many_tokens
 
 
 def backbone(config: ModelConfig, levels: tuple[int, ...], name: str) -> linen.Module:
@@ -33,6 +46,5 @@ def backbone(config: ModelConfig, levels: tuple[int, ...], name: str) -> linen.M
 
 def neck(config: ModelConfig, name: str) -> linen.Module:
     """Brings a pyramid's maps together: at the coarsest size, at the finest where fusion has no tokens or many."""
-    coarse = config.fusion == "tr" and not config.many_tokens
-    kind = pyramid.DownsamplingPyramid if coarse else pyramid.UpsamplingPyramid
+    kind = pyramid.UpsamplingPyramid if fine_maps(config) else pyramid.DownsamplingPyramid
     return kind(map_channels(config), compute(config), name=name)

@@ -4,7 +4,7 @@ Each maps features [N, F], or with the 2D latent a map of tokens [N, *grid, C], 
 full size, 2 and 4 halved once and twice. Those of tokens are a convolution, doublings at full width, then three with
 half, a quarter and an eighth of it, each of which ends in one scale. What heads are built of stands at the end.
 
-With first_guess="training_mean", an addition to the paper (docs/design.md says what it brings), a decoder draws the
+With first_guess=TrainingMean, an addition to the paper (docs/design.md says what it brings), a decoder draws the
 difference from the average training frame, which the training loop measures before the first step (FirstGuess): a
 fresh model predicts the average and learns the rest.
 """
@@ -16,7 +16,7 @@ import jax.numpy as jnp
 from flax import linen
 
 from muvo_jax import head as head_lib
-from muvo_jax.config import ModelConfig
+from muvo_jax.config import ModelConfig, TokenLatent, ZeroGuess
 from muvo_jax.model import common, memory, tokens
 from muvo_jax.nn import layers, norm
 from muvo_jax.ops import resample
@@ -136,7 +136,7 @@ class StyledDecoder(linen.Module):
         shrink = 2 ** (self.blocks + 3)
         if any(side % shrink for side in self.shape):
             raise ValueError(f"a decoder of {self.shape} voxels doubles {self.blocks + 3} times: each side must be a "
-                             f"multiple of {shrink}. Change model.voxels or model.occupancy_blocks.")
+                             f"multiple of {shrink}. Change model.voxels or model.latent.occupancy_blocks.")
         start = tuple(side // shrink for side in self.shape)
         constant = self.param("constant", layers.shape_only, (*start, self.constant_width)).astype(self.compute.dtype)
         x = jnp.broadcast_to(constant[None], (features.shape[0], *constant.shape))
@@ -252,7 +252,7 @@ def initial_constants(config: ModelConfig) -> dict[str, float]:
             continue
         for scale in head.scales:
             path = f"decoders_{name}/head_{scale}"
-            if config.first_guess != "zero" and head.average is not None:
+            if not isinstance(config.first_guess, ZeroGuess) and head.average is not None:
                 values |= {f"{path}/bias": 0.0, f"{path}/kernel": 0.0}
             else:
                 values[f"{path}/bias"] = head.initial_bias
@@ -272,17 +272,19 @@ def of_range_view(config: ModelConfig, channels: int) -> linen.Module:
 def of_voxels(config: ModelConfig, channels: int) -> linen.Module:
     """What fills the voxel grid."""
     width, compute = config.occupancy_channels, common.compute(config)
-    if config.latent == "2d":
-        return TokenDecoder(channels, 2 * width, width, config.occupancy_token_stages, compute)
-    return StyledDecoder(config.voxels.shape, channels, 2 * width, width, config.occupancy_blocks, compute=compute)
+    if isinstance(config.latent, TokenLatent):
+        return TokenDecoder(channels, 2 * width, width, config.latent.occupancy_token_stages, compute)
+    return StyledDecoder(config.voxels.shape, channels, 2 * width, width, config.latent.occupancy_blocks,
+                         compute=compute)
 
 
 def of_ground_plan(config: ModelConfig, classes: int) -> linen.Module:
     """What draws classes and instances on the ground plan of the voxel grid."""
     width, compute, channels = config.decoder_channels, common.compute(config), classes + INSTANCE_CHANNELS
-    if config.latent == "2d":
-        return TokenDecoder(channels, width, width, config.occupancy_token_stages, compute, BirdsEyeHead, flat=True)
-    return StyledDecoder(config.voxels.shape[:2], channels, width, width, config.occupancy_blocks, BirdsEyeHead,
+    if isinstance(config.latent, TokenLatent):
+        return TokenDecoder(channels, width, width, config.latent.occupancy_token_stages, compute, BirdsEyeHead,
+                            flat=True)
+    return StyledDecoder(config.voxels.shape[:2], channels, width, width, config.latent.occupancy_blocks, BirdsEyeHead,
                          compute)
 
 
@@ -293,7 +295,7 @@ def of_numbers(config: ModelConfig, channels: int) -> linen.Module:
 
 def _plane(config: ModelConfig, channels: int, size: tuple[int, int], token_shrink: int) -> linen.Module:
     width, compute = config.decoder_channels, common.compute(config)
-    if config.latent == "2d":
+    if isinstance(config.latent, TokenLatent):
         stages = token_shrink.bit_length() - 4  # three more doublings end in an output each
         return TokenDecoder(channels, width, width, stages, compute)
     return PlaneDecoder(size, channels, width, compute)

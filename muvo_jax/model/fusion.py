@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 from flax import linen
 
+from muvo_jax import config as config_lib
 from muvo_jax.config import ModelConfig
 from muvo_jax.model import common
 from muvo_jax.nn import attention, layers, norm, resnet
@@ -36,7 +37,7 @@ class Compression(linen.Module):
         return x.reshape(x.shape[0], -1) if self.keep_cells else jnp.mean(x, axis=(1, 2))
 
 
-class TransformerFusion(linen.Module):
+class TransformerFuser(linen.Module):
     """TR: the cells of both maps are tokens of one transformer.
 
     Image and lidar maps [N, h, w, token_channels]. For the 1D latent each sensor's tokens are then pooled to a vector
@@ -49,10 +50,11 @@ class TransformerFusion(linen.Module):
     @linen.compact
     def __call__(self, image_map: jax.Array | None, lidar_map: jax.Array | None, measurements: list[jax.Array],
                  mode: norm.Mode, keys: jax.Array | None) -> jax.Array:
-        config, compute = self.config, common.compute(self.config)
+        config, compute, latent = self.config, common.compute(self.config), self.config.latent
+        fusion = common.token_fusion(config)
         maps = {name: cells for name, cells in (("image", image_map), ("lidar", lidar_map)) if cells is not None}
-        channels = config.token_channels
-        as_tokens = measurements if config.latent == "2d" else []
+        channels = fusion.token_channels
+        as_tokens = measurements if isinstance(latent, config_lib.TokenLatent) else []
         type_embedding = self.param("type_embedding", layers.shape_only, (len(maps) + len(as_tokens), channels))
         tokens = []
         for index, cells in enumerate(maps.values()):
@@ -60,22 +62,22 @@ class TransformerFusion(linen.Module):
             tokens.append(cells.reshape(cells.shape[0], -1, channels) + added[None].astype(cells.dtype))
         for index, value in enumerate(as_tokens, start=len(maps)):
             tokens.append(jnp.expand_dims(value + type_embedding[index][None].astype(value.dtype), 1))
-        mixed = attention.TransformerEncoder(
-            config.transformer_layers, config.transformer_heads, config.transformer_hidden_channels, config.dropout,
-            compute, name="transformer")(jnp.concatenate(tokens, axis=1), keys)
-        if config.latent == "2d":
+        transformer = attention.TransformerEncoder(fusion.layers, fusion.heads, fusion.hidden_channels, fusion.dropout,
+                                                   compute, name="transformer")
+        mixed = transformer(jnp.concatenate(tokens, axis=1), keys)
+        if isinstance(latent, config_lib.TokenLatent):
             return mixed.astype(jnp.float32)
-        compress = functools.partial(Compression, config.fused_channels, compute, keep_cells=config.keep_cells)
+        compress = functools.partial(Compression, latent.fused_channels, compute, keep_cells=latent.keep_cells)
         vectors, start = [], 0
         for name, cells in maps.items():
             stop = start + cells.shape[1] * cells.shape[2]
             vectors.append(compress(name=f"{name}_compression")(mixed[:, start:stop].reshape(cells.shape), mode))
             start = stop
         joined = jnp.concatenate([*vectors, *measurements], axis=-1)
-        return layers.Dense(config.embedding_channels, compute, name="combine")(joined).astype(jnp.float32)
+        return layers.Dense(latent.embedding_channels, compute, name="combine")(joined).astype(jnp.float32)
 
 
-class PooledFusion(linen.Module):
+class PooledFuser(linen.Module):
     """What FC and AVG have in common: each sensor's map becomes one vector.
 
     The measurements [N, measurement_channels] are spread over the image map [N, h, w, map_channels], which goes through
@@ -99,35 +101,39 @@ class PooledFusion(linen.Module):
         return vectors
 
 
-class ConcatenationFusion(PooledFusion):
+class ConcatenationFuser(PooledFuser):
     """FC: both vectors side by side, then a dense layer."""
 
     @linen.compact
     def __call__(self, image_map: jax.Array | None, lidar_map: jax.Array | None, measurements: list[jax.Array],
                  mode: norm.Mode, keys: jax.Array | None) -> jax.Array:
         del keys
-        both = self.vectors(image_map, lidar_map, measurements, mode, self.config.fused_channels)
-        join = layers.Dense(self.config.embedding_channels, common.compute(self.config), name="join")
+        latent = config_lib.as_kind(self.config.latent, config_lib.VectorLatent)
+        both = self.vectors(image_map, lidar_map, measurements, mode, latent.fused_channels)
+        join = layers.Dense(latent.embedding_channels, common.compute(self.config), name="join")
         return join(jnp.concatenate(both, axis=-1)).astype(jnp.float32)
 
 
-class AverageFusion(PooledFusion):
+class AverageFuser(PooledFuser):
     """AVG: the mean of both vectors (the paper says so; in the reference's code the line is commented out)."""
 
     @linen.compact
     def __call__(self, image_map: jax.Array | None, lidar_map: jax.Array | None, measurements: list[jax.Array],
                  mode: norm.Mode, keys: jax.Array | None) -> jax.Array:
         del keys
-        vectors = self.vectors(image_map, lidar_map, measurements, mode, self.config.embedding_channels)
+        latent = config_lib.as_kind(self.config.latent, config_lib.VectorLatent)
+        vectors = self.vectors(image_map, lidar_map, measurements, mode, latent.embedding_channels)
         return jnp.mean(jnp.stack(vectors).astype(jnp.float32), axis=0)
 
 
-REGISTRY: dict[str, type[linen.Module]] = {"tr": TransformerFusion, "fc": ConcatenationFusion, "avg": AverageFusion}
+REGISTRY: dict[type, type[linen.Module]] = {
+    config_lib.TransformerFusion: TransformerFuser, config_lib.ConcatenationFusion: ConcatenationFuser,
+    config_lib.AverageFusion: AverageFuser}
 
 
 def initial_constants(config: ModelConfig) -> dict[str, float]:
     """Path of a parameter -> its first value: a fresh fusion transformer hands its tokens through unmixed."""
-    if config.fusion != "tr":
+    if not isinstance(config.fusion, config_lib.TransformerFusion):
         return {}
     return {f"fusion/transformer/layer{index}/{layer}/kernel": 0.0
-            for index in range(config.transformer_layers) for layer in ("self_attn/out_proj", "linear2")}
+            for index in range(config.fusion.layers) for layer in ("self_attn/out_proj", "linear2")}

@@ -12,9 +12,10 @@ import math
 import flax.struct
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from muvo_jax import head as head_lib
-from muvo_jax.config import ModelConfig
+from muvo_jax.config import LastSeen, ModelConfig, as_kind
 from muvo_jax.geometry import VoxelGrid
 from muvo_jax.model import memory as memory_lib
 from muvo_jax.ops import motion as motion_ops
@@ -89,13 +90,13 @@ class Sight:
 
     Attributes:
       rows: int32 [n], the drive of each.
-      index: int32 [n, F], places in the drive's memory; `known`, bool [n, F], whether something was observed there.
+      places: int32 [n, F], in the drive's memory; `known`, bool [n, F], whether something was observed there.
       pose: float32 [n, F, 3], where the vantage stands in the ego frame of each.
       ahead: int32 [n], steps from the newest to the vantage.
     """
 
     rows: Array
-    index: Array
+    places: Array
     known: Array
     pose: Array
     ahead: Array
@@ -116,7 +117,7 @@ def look(config: ModelConfig, memory: Memory, rows: Array, vantage: Vantage,
       heads: what is decoded.
     """
     heads = tuple(head for head in memory_lib.guessed_heads(config) if head in heads)
-    places = config.memory_frames
+    places = as_kind(config.first_guess, LastSeen).memory_frames
     stop = vantage.last + (vantage.steps > 0)
     index = stop[:, None] + jnp.arange(-places, 0, dtype=jnp.int32)[None]
     known = (index >= vantage.first[:, None]) & (index >= 0)
@@ -140,8 +141,8 @@ def look(config: ModelConfig, memory: Memory, rows: Array, vantage: Vantage,
 def _scans(memory: Memory, sight: Sight) -> tuple[Array, Array, Array]:
     """The scans [n, F, Hr * Wr, 4] in sight as they were, their points [..., 3] in the frame of the vantage, and which
     of these [...] are returns."""
-    scans = memory.range_view[sight.rows[:, None], sight.index]
-    scans = scans.reshape(*sight.index.shape, -1, 4)
+    scans = memory.range_view[sight.rows[:, None], sight.places]
+    scans = scans.reshape(*sight.places.shape, -1, 4)
     valid = (scans[..., 3] > 0.0) & jnp.expand_dims(sight.known, -1)
     return scans, motion_ops.into_frame(scans[..., :3], sight.pose), valid
 
@@ -157,7 +158,7 @@ def _ranges(config: ModelConfig, memory: Memory, sight: Sight) -> RangeGlimpse:
         return jnp.where(on_beams, reproject.onto_beams(moved, geometry), moved)
 
     moved = newest = splat(slice(-1, None))
-    if sight.index.shape[1] > 1:
+    if sight.places.shape[1] > 1:
         moved = jnp.where(newest[..., 3:] > 0.0, newest, splat(slice(None, -1)))
     returned = moved[..., 3] > 0.0
     fresh = sight.known[:, -1].reshape(-1, 1, 1)
@@ -175,10 +176,10 @@ def _image(config: ModelConfig, memory: Memory, sight: Sight, view: RangeGlimpse
     images, rows = memory.image.reshape(-1, *memory.image.shape[2:]), sight.rows
     moved, inside = reproject.move_image(images, view.filled_m, sight.pose[:, -1], memory.intrinsics[rows],
                                          memory.camera_to_ego[rows], config.range_view,
-                                         rows * memory.image.shape[1] + sight.index[:, -1])
+                                         rows * memory.image.shape[1] + sight.places[:, -1])
     known = sight.known[:, -1].astype(jnp.float32).reshape(-1, 1, 1, 1)
     covered = jnp.where(jnp.expand_dims(inside, -1), 1.0, EDGE) * known
-    colour = memory.image.astype(jnp.float32).mean(axis=(2, 3))[rows, sight.index[:, -1]].reshape(-1, 1, 1, 3)
+    colour = memory.image.astype(jnp.float32).mean(axis=(2, 3))[rows, sight.places[:, -1]].reshape(-1, 1, 1, 3)
     return ImageGlimpse(image=moved / 255.0 * covered, covered=covered, colour=colour / 255.0 * known)
 
 
@@ -186,7 +187,7 @@ def _voxels(config: ModelConfig, memory: Memory, sight: Sight) -> VoxelGlimpse:
     if memory.evidence is None:
         evidence, hits = _evidence(config, memory, sight, config.voxels)
         glimpse = _gathered(evidence)
-        if not config.follow_movers:
+        if not as_kind(config.first_guess, LastSeen).follow_movers:
             return glimpse
         ahead = jnp.expand_dims(sight.ahead, -1)
         return dataclasses.replace(glimpse, onward=_onward(memory, sight, evidence, hits, ahead, config.voxels)[:, 0])
@@ -208,9 +209,9 @@ def _evidence(config: ModelConfig, memory: Memory, sight: Sight, grid: VoxelGrid
     A voxel that holds a return is occupied, as in the labels; the beam through its centre says the rest.
     """
     frames, view = memory.pose.shape[1], config.range_view
-    size = (*sight.index.shape, *grid.shape)
+    size = (*sight.places.shape, *grid.shape)
     scans_m = memory.range_view[..., 3].reshape(-1, view.rows, view.columns)
-    which = (sight.rows[:, None] * frames + sight.index).reshape(-1)
+    which = (sight.rows[:, None] * frames + sight.places).reshape(-1)
     evidence = reproject.scan_evidence(scans_m, which, sight.pose.reshape(-1, 3), grid, view).reshape(size)
     evidence = jnp.where(sight.known.reshape(*sight.known.shape, 1, 1, 1), evidence, 0.0)
     _, points_m, valid = _scans(memory, sight)
@@ -248,12 +249,26 @@ def with_evidence(config: ModelConfig, memory: Memory | None, vantage: Vantage |
     """The memory with the evidence for voxels worked out once, for many states that are imagined from its newest
     observation: a planner's. Resampled from there it is a little blurred, and ends half a grid beyond the grid.
 
+    What is decoded with it must be imagined, at least one step, from there: see memory.check_evidence.
+
     vantage: [B], of the states from which imagination starts; None where there is no memory.
+
+    Raises:
+      ValueError: if the vantage is not [B], or is concrete and not that of the newest observation.
     """
     if memory is None or vantage is None or (
             "occupancy" not in memory_lib.views(memory_lib.guessed_heads(config))):
         return memory
-    places, rows = config.memory_frames, jnp.arange(memory.pose.shape[0])
+    drives, frames = memory.pose.shape[:2]
+    if jnp.shape(vantage.last) != (drives,):
+        raise ValueError(f"with_evidence: got a vantage {list(jnp.shape(vantage.last))}, expected [{drives}], a "
+                         f"start in each drive of the memory.")
+    elsewhere = lambda: (np.asarray(vantage.last) != frames - 1) | (np.asarray(vantage.steps) != 0)
+    if not memory_lib.traced(vantage) and elsewhere().any():
+        raise ValueError("with_evidence: the vantage is not that of the memory's newest observation; take it from "
+                         "observed.last or from the latent of a stream.")
+    guess = as_kind(config.first_guess, LastSeen)
+    places, rows = guess.memory_frames, jnp.arange(memory.pose.shape[0])
     newest = memory.pose.shape[1] + jnp.arange(-places, 0, dtype=jnp.int32)
     index = jnp.broadcast_to(newest[None], (rows.shape[0], places))
     known = (index >= vantage.first[:, None]) & (index >= 0)
@@ -263,7 +278,7 @@ def with_evidence(config: ModelConfig, memory: Memory | None, vantage: Vantage |
     evidence, hits = _evidence(config, memory, sight, grid)
     gathered = _gathered(evidence)
     memory = dataclasses.replace(memory, evidence=jnp.concatenate([gathered.newest, gathered.older], axis=-1))
-    if not config.follow_movers:
+    if not guess.follow_movers:
         return memory
     ahead = jnp.broadcast_to(1 + jnp.arange(FORESEEN_STEPS)[None], (rows.shape[0], FORESEEN_STEPS))
     return dataclasses.replace(memory, onward=_onward(memory, sight, evidence, hits, ahead, grid))

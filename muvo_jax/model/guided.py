@@ -1,4 +1,4 @@
-"""Decoders that see the memory: a U-net whose deepest map is the latent's (model.first_guess="last_seen").
+"""Decoders that see the memory: a U-net whose deepest map is the latent's (config.LastSeen).
 
 On the way down it reads the memory as it looks from the state's vantage, on the way up it draws what must be added to
 that, where it covers anything, and to the average training frame elsewhere. So a fresh model predicts the moved memory

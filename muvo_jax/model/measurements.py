@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 from flax import linen
 
-from muvo_jax.config import ModelConfig
+from muvo_jax.config import ModelConfig, VectorLatent
 from muvo_jax.model import camera, common
 from muvo_jax.nn import layers, norm, resnet
 from muvo_jax.ops import conv_cpu
@@ -69,7 +69,7 @@ class CommandEncoder(linen.Module):
     def __call__(self, command: jax.Array) -> jax.Array:
         channels = self.config.measurement_channels // 2
         embedding = self.param("embedding", layers.shape_only, (COMMANDS, channels))
-        out = channels if self.config.latent == "1d" else common.measurement_channels(self.config)
+        out = channels if isinstance(self.config.latent, VectorLatent) else common.measurement_channels(self.config)
         return jax.nn.relu(layers.Mlp((channels, out), common.compute(self.config), name="mlp")(
             jnp.take(embedding, command, axis=0)))
 

@@ -1,4 +1,4 @@
-"""What was seen of late, and where a state stands to it: the geometric memory (first_guess="last_seen").
+"""What was seen of late, and where a state stands to it: the geometric memory (config.LastSeen).
 
 Moving what the sensors showed by the motion of the car needs no learning, and says most of what the next frames show.
 So a model with this memory keeps its last observations as they came (types.Memory, beside the states, once for all
@@ -12,20 +12,21 @@ import dataclasses
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from muvo_jax import head as head_lib
-from muvo_jax.config import KNOWN_HEADS, NO_SENSOR, ModelConfig
+from muvo_jax.config import KNOWN_HEADS, LastSeen, ModelConfig
 from muvo_jax.ops import motion as motion_ops
 from muvo_jax.types import UNTIMED_FIELDS, Array, Batch, LatentState, Memory, Motion, Vantage
 
 
 def guessed_heads(config: ModelConfig) -> tuple[str, ...]:
     """The heads whose decoders see the memory: what cannot be moved (nothing moves without ranges) is not guessed."""
-    if config.first_guess != "last_seen" or config.lidar == NO_SENSOR:
+    if not isinstance(config.first_guess, LastSeen) or config.lidar is None:
         return ()
     guides = {name: head_lib.get(name).guide for name in KNOWN_HEADS if name in config.heads}
     return tuple(name for name, guide in guides.items() if guide is not None
-                 and (guide.view != "image" or config.camera != NO_SENSOR))
+                 and (guide.view != "image" or config.camera is not None))
 
 
 def views(heads: tuple[str, ...]) -> frozenset[str]:
@@ -49,7 +50,8 @@ def stream_places(config: ModelConfig) -> int:
 
     That one is hidden from the decoders of its own state, which look at as many before it, as those of a window do.
     """
-    return config.memory_frames + 1
+    guess = config.first_guess
+    return (guess.memory_frames if isinstance(guess, LastSeen) else 0) + 1
 
 
 def initial_vantage(config: ModelConfig, batch_size: int) -> Vantage:
@@ -177,6 +179,7 @@ def check(config: ModelConfig, states: LatentState | Array, memory: Memory | Non
             raise ValueError(f"decode: memory.{name} is {None if value is None else list(value.shape)}, expected "
                              f"{list(expected)} beside memory.pose {list(memory.pose.shape)}; this memory belongs to "
                              f"another model or is of two.")
+    check_evidence(states, memory)
     flat = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[len(lead):]), states.vantage)
     count = flat.last.shape[0]
     if rows is not None:
@@ -188,3 +191,20 @@ def check(config: ModelConfig, states: LatentState | Array, memory: Memory | Non
         raise ValueError(f"decode: got states [{', '.join(map(str, (*lead, '...')))}] and a memory of {drives} drives; "
                          f"the first axis of the states must count the drives. Pass rows= otherwise.")
     return flat, jnp.repeat(jnp.arange(drives, dtype=jnp.int32), count // drives)
+
+
+def check_evidence(states: LatentState, memory: Memory | None) -> None:
+    """Raises ValueError where concrete states are none that a memory `with_evidence` was made for; traced ones pass."""
+    vantage = states.vantage
+    if memory is None or memory.evidence is None or vantage is None or traced(vantage):
+        return
+    newest, steps, last = memory.pose.shape[1] - 1, np.asarray(vantage.steps), np.asarray(vantage.last)
+    if (steps < 1).any() or (last != newest).any():
+        raise ValueError(f"decode: the memory's evidence holds for states imagined from its newest observation, number "
+                         f"{newest}; got states {np.unique(steps).tolist()} steps (0: not imagined) from observations "
+                         f"{np.unique(last).tolist()}. Decode these with the memory as it was before with_evidence.")
+
+
+def traced(vantage: Vantage) -> bool:
+    """Whether the numbers of a vantage cannot be looked at."""
+    return isinstance(vantage.steps, jax.core.Tracer) or isinstance(vantage.last, jax.core.Tracer)

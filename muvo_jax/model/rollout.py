@@ -224,9 +224,12 @@ def decode(model: WorldModel, variables: Variables, states: LatentState | Dream 
     A model with first_guess="last_seen" needs the `memory` of the drives too: Observed.memory or LiveState.memory.
 
     Raises:
+      ValueError: for concrete states that the memory's evidence does not hold for (memory.with_evidence).
       TypeError: for forward-mode derivatives through convolutions that have none (ModelConfig.convolution).
     """
     states = states.states if isinstance(states, Dream) else states
+    if isinstance(states, LatentState):
+        memory_lib.check_evidence(states, memory)
     checks.forward_mode("decode", model, variables, states, memory)
     return _decode(model, variables, states, None if heads is None else tuple(heads), memory, rows)
 

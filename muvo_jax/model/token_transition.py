@@ -5,7 +5,7 @@ also see a gated mean of all tokens. Prior and posterior are transformer decoder
 of the state, look at the tokens of h', of the action and, for the posterior, of the observation.
 
 Differs from the reference where the posterior looks at h' without the type embedding that marks it in the prior: an
-omission there, kept by numerics="reference". With `model.aligned_tokens` a query starts from the token's own h' and, in
+omission there, kept by numerics="reference". With `aligned_tokens` a query starts from the token's own h' and, in
 the posterior, from what the observation has in its place, which attention need not find first.
 """
 
@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 from flax import linen
 
-from muvo_jax.config import ModelConfig
+from muvo_jax.config import ModelConfig, TokenLatent, as_kind
 from muvo_jax.model import common, filtering, tokens
 from muvo_jax.nn import attention, layers
 from muvo_jax.types import Gaussian, LatentState
@@ -60,7 +60,8 @@ class TokenGaussianHead(linen.Module):
     def __call__(self, memory: jax.Array, keys: jax.Array | None, first_site: int,
                  start: jax.Array | None = None) -> Gaussian:
         config, compute = self.config, common.compute(self.config)
-        channels, groups = config.token_channels, tokens.groups(config)
+        fusion, latent = common.token_fusion(config), as_kind(config.latent, TokenLatent)
+        channels, groups = fusion.token_channels, tokens.groups(config)
         type_embedding = self.param("type_embedding", layers.shape_only, (len(groups), channels))
         queries = []
         for index, (name, grid) in enumerate(groups.items()):
@@ -73,8 +74,8 @@ class TokenGaussianHead(linen.Module):
         if start is not None:
             x = x + start.astype(x.dtype)
         x = attention.TransformerDecoder(
-            config.transition_layers, config.transformer_heads, config.transformer_hidden_channels, config.dropout,
-            compute, name="transformer")(x, memory.astype(compute.dtype), keys, first_site)
+            latent.transition_layers, fusion.heads, fusion.hidden_channels, fusion.dropout, compute,
+            name="transformer")(x, memory.astype(compute.dtype), keys, first_site)
         return filtering.gaussian(layers.Dense(2 * channels, compute, name="moments")(x))
 
 
@@ -83,28 +84,31 @@ class TokenTransition(filtering.Transition):
 
     def setup(self):
         config, compute = self.config, common.compute(self.config)
+        channels = common.token_fusion(config).token_channels
         self.slope = filtering.LEAKY_SLOPE[config.numerics]
-        self.type_embedding = self.param("type_embedding", layers.shape_only, (3, config.token_channels))
-        self.pre_gru = layers.Dense(config.token_channels, compute)
-        self.gru = TokenGRU(config.token_channels, compute)
-        self.prior_action, self.posterior_action = (layers.Dense(config.token_channels, compute) for _ in range(2))
+        self.type_embedding = self.param("type_embedding", layers.shape_only, (3, channels))
+        self.pre_gru = layers.Dense(channels, compute)
+        self.gru = TokenGRU(channels, compute)
+        self.prior_action, self.posterior_action = (layers.Dense(channels, compute) for _ in range(2))
         self.prior, self.posterior = TokenGaussianHead(config), TokenGaussianHead(config)
-        if config.aligned_tokens:
+        latent = as_kind(config.latent, TokenLatent)
+        self.aligned, self.layers = latent.aligned_tokens, latent.transition_layers
+        if self.aligned:
             self.prior_own, self.posterior_own, self.posterior_seen = (
-                layers.Dense(config.token_channels, compute) for _ in range(3))
+                layers.Dense(channels, compute) for _ in range(3))
         if config.action_path == "recurrence":
             self.action_spread = self.variable("batch_stats", "action_spread", jnp.ones, (2,))
             self.driven, self.prior_driven, self.posterior_driven = (
-                layers.Dense(config.token_channels, compute) for _ in range(3))
+                layers.Dense(channels, compute) for _ in range(3))
 
     @staticmethod
     def state_shapes(config: ModelConfig) -> tuple[tuple[int, ...], tuple[int, ...]]:
-        shape = (tokens.count(config), config.token_channels)
+        shape = (tokens.count(config), common.token_fusion(config).token_channels)
         return shape, shape
 
     @staticmethod
     def initial_constants(config: ModelConfig) -> dict[str, np.ndarray]:
-        bias = filtering.initial_moments(config.token_channels)
+        bias = filtering.initial_moments(common.token_fusion(config).token_channels)
         return {f"{head}/moments/bias": bias for head in ("prior", "posterior")}
 
     def recur(self, state: LatentState, effect: jax.Array | None) -> jax.Array:
@@ -116,7 +120,7 @@ class TokenTransition(filtering.Transition):
     def predict(self, deterministic: jax.Array, action: jax.Array, effect: jax.Array | None,
                 keys: jax.Array | None) -> Gaussian:
         memory = jnp.concatenate([self._typed(deterministic, 1), self._action(self.prior_action, action)], axis=-2)
-        start = self.prior_own(deterministic) if self.config.aligned_tokens else None
+        start = self.prior_own(deterministic) if self.aligned else None
         if effect is not None:
             start = _added(start, self.prior_driven(effect), deterministic.shape)
         return self.prior(memory, keys, 0, start)
@@ -127,12 +131,12 @@ class TokenTransition(filtering.Transition):
         memory = jnp.concatenate([remembered, self._typed(embedding, 0), self._action(self.posterior_action, action)],
                                  axis=-2)
         start = None
-        if self.config.aligned_tokens:
+        if self.aligned:
             seen = tokens.of_observation(self.posterior_seen(embedding), self.config)
             start = self.posterior_own(deterministic) + seen
         if effect is not None:
             start = _added(start, self.posterior_driven(effect), deterministic.shape)
-        sites = attention.SITES_PER_DECODER_LAYER * self.config.transition_layers
+        sites = attention.SITES_PER_DECODER_LAYER * self.layers
         return self.posterior(memory, keys, sites, start)
 
     def _typed(self, values: jax.Array, kind: int) -> jax.Array:

@@ -12,7 +12,8 @@ import math
 import jax
 import jax.numpy as jnp
 
-from muvo_jax.config import ModelConfig
+from muvo_jax.config import ModelConfig, PlaneCamera, RangeViewLidar, TokenLatent, as_kind
+from muvo_jax.model import common
 
 IMAGE_SHRINK, RANGE_VIEW_SHRINK = 32, 16
 
@@ -20,7 +21,7 @@ IMAGE_SHRINK, RANGE_VIEW_SHRINK = 32, 16
 def groups(config: ModelConfig) -> dict[str, tuple[int, ...]]:
     """Name of a group -> its grid; () is a single token."""
     view = config.range_view
-    voxel_shrink = 2 ** (config.occupancy_token_stages + 3)
+    voxel_shrink = 2 ** (as_kind(config.latent, TokenLatent).occupancy_token_stages + 3)
     return {"image": tuple(side // IMAGE_SHRINK for side in config.image_size),
             "range_view": (view.rows // RANGE_VIEW_SHRINK, view.columns // RANGE_VIEW_SHRINK),
             "occupancy": tuple(side // voxel_shrink for side in config.voxels.shape),
@@ -62,15 +63,16 @@ def pool(features: jax.Array, config: ModelConfig) -> jax.Array:
 def of_observation(embedding: jax.Array, config: ModelConfig) -> jax.Array:
     """An observation's tokens [..., M, C] in the places of the state's tokens: [..., N, C].
 
-    The image's cells go to the group "image" with camera "wob", the range view's to "range_view" with lidar "rv": those
-    have the same grids, unless there are many tokens. What has no counterpart gets the mean of the whole observation.
+    The image's cells go to the group "image" with PlaneCamera, the range view's to "range_view" with RangeViewLidar:
+    those have the same grids, unless there are many tokens. What has no counterpart gets the mean of the whole
+    observation.
     """
     sizes = {group: math.prod(grid) for group, grid in groups(config).items()}
     lidar_ends = embedding.shape[-2] - (config.route + 3 * config.navigation + config.speed)
     placed = {}
-    if config.camera == "wob" and not config.many_tokens:
+    if isinstance(config.camera, PlaneCamera) and not common.fine_maps(config):
         placed["image"] = embedding[..., :sizes["image"], :]
-    if config.lidar == "rv" and not config.many_tokens:
+    if isinstance(config.lidar, RangeViewLidar) and not common.fine_maps(config):
         placed["range_view"] = embedding[..., lidar_ends - sizes["range_view"]:lidar_ends, :]
     whole = embedding.mean(axis=-2, keepdims=True)
     spread = lambda size: jnp.broadcast_to(whole, (*whole.shape[:-2], size, whole.shape[-1]))

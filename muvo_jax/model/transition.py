@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from flax import linen
 
-from muvo_jax.config import ModelConfig
+from muvo_jax.config import ModelConfig, TokenLatent, VectorLatent, as_kind
 from muvo_jax.model import common, filtering, token_transition
 from muvo_jax.nn import layers
 from muvo_jax.ops import precision
@@ -64,22 +64,24 @@ class VectorTransition(filtering.Transition):
 
     def setup(self):
         config, compute = self.config, common.compute(self.config)
+        latent = as_kind(config.latent, VectorLatent)
         self.slope = filtering.LEAKY_SLOPE[config.numerics]
-        self.pre_gru = layers.Dense(config.deterministic_channels, compute)
-        self.gru = GRUCell(config.deterministic_channels, compute)
-        head = lambda: GaussianHead(config.stochastic_channels, config.action_channels, self.slope, compute)
+        self.pre_gru = layers.Dense(latent.deterministic_channels, compute)
+        self.gru = GRUCell(latent.deterministic_channels, compute)
+        head = lambda: GaussianHead(latent.stochastic_channels, latent.action_channels, self.slope, compute)
         self.prior, self.posterior = head(), head()
         if config.action_path == "recurrence":
             self.action_spread = self.variable("batch_stats", "action_spread", jnp.ones, (2,))
-            self.driven = layers.Dense(config.deterministic_channels, compute)
+            self.driven = layers.Dense(latent.deterministic_channels, compute)
 
     @staticmethod
     def state_shapes(config: ModelConfig) -> tuple[tuple[int, ...], tuple[int, ...]]:
-        return (config.deterministic_channels,), (config.stochastic_channels,)
+        latent = as_kind(config.latent, VectorLatent)
+        return (latent.deterministic_channels,), (latent.stochastic_channels,)
 
     @staticmethod
     def initial_constants(config: ModelConfig) -> dict[str, np.ndarray]:
-        bias = filtering.initial_moments(config.stochastic_channels)
+        bias = filtering.initial_moments(as_kind(config.latent, VectorLatent).stochastic_channels)
         return {f"{head}/out/bias": bias for head in ("prior", "posterior")}
 
     def recur(self, state: LatentState, effect: jax.Array | None) -> jax.Array:
@@ -99,10 +101,11 @@ class VectorTransition(filtering.Transition):
         return self.posterior(jnp.concatenate([deterministic, embedding], axis=-1), action)
 
 
-REGISTRY: dict[str, type[filtering.Transition]] = {"1d": VectorTransition, "2d": token_transition.TokenTransition}
+REGISTRY: dict[type, type[filtering.Transition]] = {
+    VectorLatent: VectorTransition, TokenLatent: token_transition.TokenTransition}
 
 
 def initial_constants(config: ModelConfig) -> dict[str, np.ndarray]:
     """Path of a parameter -> its first value, for the latent that this model has."""
-    constants = REGISTRY[config.latent].initial_constants(config)
+    constants = REGISTRY[type(config.latent)].initial_constants(config)
     return {f"transition/{name}": value for name, value in constants.items()}

@@ -22,7 +22,7 @@ import jax.numpy as jnp
 from flax import linen
 
 from muvo_jax import head as head_lib
-from muvo_jax.config import KNOWN_HEADS, NO_SENSOR, ModelConfig
+from muvo_jax.config import KNOWN_HEADS, ModelConfig, TokenLatent, TransformerFusion, ZeroGuess
 from muvo_jax.model import camera, decoders, fusion, glimpse, guided, lidar, measurements, tokens, transition
 from muvo_jax.model import memory as memory_lib
 from muvo_jax.nn import init as init_lib
@@ -51,10 +51,10 @@ class Network(linen.Module):
 
     def setup(self):
         config = self.config
-        if config.camera != NO_SENSOR:
-            self.camera = camera.REGISTRY[config.camera](config)
-        if config.lidar != NO_SENSOR:
-            self.lidar = lidar.REGISTRY[config.lidar](config)
+        if config.camera is not None:
+            self.camera = camera.REGISTRY[type(config.camera)](config)
+        if config.lidar is not None:
+            self.lidar = lidar.REGISTRY[type(config.lidar)](config)
         if config.route:
             self.route = measurements.ROUTE_ENCODERS[config.route_encoder](config)
         if config.navigation:
@@ -63,12 +63,12 @@ class Network(linen.Module):
             self.target = measurements.TargetEncoder(config)
         if config.speed:
             self.speed = measurements.SpeedEncoder(config)
-        self.fusion = fusion.REGISTRY[config.fusion](config)
+        self.fusion = fusion.REGISTRY[type(config.fusion)](config)
         guessed = memory_lib.guessed_heads(config)
         described = {name: head_lib.get(name) for name in KNOWN_HEADS if name in config.heads}
         self.decoders = {name: guided.GuidedHead(config, head.guide) if head.guide is not None and name in guessed
                          else head.build(config) for name, head in described.items()}
-        if config.first_guess != "zero":
+        if not isinstance(config.first_guess, ZeroGuess):
             self.first_guess = {name: decoders.FirstGuess() for name, head in described.items()
                                 if head.average is not None}
 
@@ -81,8 +81,8 @@ class Network(linen.Module):
                          self.target(frames["target_m"], frames["next_target_m"])]
         if self.config.speed:
             measured.append(self.speed(frames["speed_mps"]))
-        image_map = self.camera(frames, mode) if self.config.camera != NO_SENSOR else None
-        lidar_map = self.lidar(frames, mode) if self.config.lidar != NO_SENSOR else None
+        image_map = self.camera(frames, mode) if self.config.camera is not None else None
+        lidar_map = self.lidar(frames, mode) if self.config.lidar is not None else None
         return self.fusion(image_map, lidar_map, measured, mode, keys)
 
     def decode(self, features: jax.Array, vantage: Vantage | None, memory: Memory | None, rows: jax.Array | None,
@@ -99,13 +99,13 @@ class Network(linen.Module):
                 raw[name] = self.decoders[name](read, glimpses[name], numbers, self.first_guess[name])
             else:
                 raw[name] = self.decoders[name](read)
-                if self.config.first_guess != "zero" and name in self.first_guess:
+                if not isinstance(self.config.first_guess, ZeroGuess) and name in self.first_guess:
                     raw[name] = self.first_guess[name](raw[name])
         return raw
 
     def read(self, features: jax.Array, head: str) -> jax.Array:
         """What a head decodes of the features: with the 2D latent its group of tokens, or all of them pooled."""
-        if self.config.latent == "1d":
+        if not isinstance(self.config.latent, TokenLatent):
             return features
         group = head_lib.get(head).tokens
         return tokens.pool(features, self.config) if group is None else tokens.read(features, group, self.config)
@@ -127,11 +127,7 @@ class WorldModel:
     config: ModelConfig
 
     def __post_init__(self):
-        config = self.config
-        if config.tracks_motion and config.kinematics is None and "ego_motion" not in config.heads:
-            raise ValueError(f"model.first_guess=last_seen moves what was seen as the car moves, but model.kinematics "
-                             f"is None and the heads are {', '.join(config.heads)}. Take the model of a Config whose "
-                             f"contract.kinematics is 'bicycle' (Config.model), or add the head ego_motion.")
+        self.config.check_motion()
 
     @property
     def feature_shape(self) -> tuple[int, ...]:
@@ -144,7 +140,7 @@ class WorldModel:
         With the 1D latent the features themselves; with the 2D latent the mean over the tokens of each group side by
         side, the action's token last (muvo_jax.model.tokens).
         """
-        return tokens.pool(features, self.config) if self.config.latent == "2d" else features
+        return tokens.pool(features, self.config) if isinstance(self.config.latent, TokenLatent) else features
 
     @property
     def policy_feature_channels(self) -> int:
@@ -193,7 +189,7 @@ class WorldModel:
         frames = self._frames(batch)
         mode = norm.Mode(train, axis_name)
         frame_keys = None
-        if train and self.config.dropout > 0.0:
+        if train and isinstance(self.config.fusion, TransformerFusion) and self.config.fusion.dropout > 0.0:
             if keys is None or keys.shape != (batch.batch_size,):
                 raise ValueError(f"encode(train=True): got keys {None if keys is None else keys.shape}, expected one "
                                  f"typed key per sample, shape ({batch.batch_size},), for the dropout masks.")
@@ -210,7 +206,7 @@ class WorldModel:
 
     def initial_state(self, batch_size: int) -> LatentState:
         """The zero state [batch_size, ...], before anything was seen."""
-        return transition.REGISTRY[self.config.latent].initial_state(self.config, batch_size)
+        return transition.REGISTRY[type(self.config.latent)].initial_state(self.config, batch_size)
 
     def observe_step(self, variables: Variables, noise: StepNoise, state: LatentState, action: jax.Array,
                      embedding: jax.Array, is_first: jax.Array) -> tuple[LatentState, tuple[Gaussian, Gaussian]]:
@@ -255,7 +251,7 @@ class WorldModel:
         Args:
           variables: of this model.
           states: LatentState [...], or, where no head looks at a memory, LatentState.features [..., *feature_shape].
-          memory: Memory of B drives, for a model with first_guess="last_seen" (Observed.memory, LiveState.memory).
+          memory: Memory of B drives, for a model with first_guess=LastSeen (Observed.memory, LiveState.memory).
           rows: int32 [...], the drive that each state belongs to; by default the first axis of the states counts them.
           heads: which ones; None for all that the model has. Only these are computed.
 
@@ -278,7 +274,7 @@ class WorldModel:
         lead = features.shape[:-len(shape)]
         if features.shape[len(lead):] != shape:
             raise ValueError(f"decode: got features {list(features.shape)}, expected "
-                             f"[{', '.join(map(str, ('...', *shape)))}] for the {self.config.latent} latent.")
+                             f"[{', '.join(map(str, ('...', *shape)))}] for the {self.config.latent.kind} latent.")
         vantage = None
         if set(memory_lib.guessed_heads(self.config)).isdisjoint(names):
             memory = None
@@ -292,7 +288,7 @@ class WorldModel:
     def _move(self, variables: Variables, method: str, *args) -> Any:
         """A step of the transition, by its own part of the variables."""
         own = {kind: tree["transition"] for kind, tree in variables.items() if "transition" in tree}
-        return transition.REGISTRY[self.config.latent](self.config).apply(own, *args, method=method)
+        return transition.REGISTRY[type(self.config.latent)](self.config).apply(own, *args, method=method)
 
     def _apply(self, variables: Variables, method: str, *args, **options) -> Any:
         return Network(self.config).apply(variables, *args, method=method, **options)
@@ -319,10 +315,10 @@ class WorldModel:
 def inputs(config: ModelConfig) -> dict[str, tuple[int, ...]]:
     """What a model reads: name of a Batch field -> its shape for one frame."""
     fields: dict[str, tuple[int, ...]] = {}
-    if config.camera != NO_SENSOR:
-        fields |= camera.REGISTRY[config.camera].inputs(config)
-    if config.lidar != NO_SENSOR:
-        fields |= lidar.REGISTRY[config.lidar].inputs(config)
+    if config.camera is not None:
+        fields |= camera.REGISTRY[type(config.camera)].inputs(config)
+    if config.lidar is not None:
+        fields |= lidar.REGISTRY[type(config.lidar)].inputs(config)
     if config.route:
         fields["route_map"] = ROUTE_MAP_SIZE
     if config.navigation:
@@ -334,7 +330,7 @@ def inputs(config: ModelConfig) -> dict[str, tuple[int, ...]]:
 
 @functools.lru_cache(maxsize=8)
 def _variable_shapes(config: ModelConfig) -> dict[str, Any]:
-    network, moving = Network(config), transition.REGISTRY[config.latent](config)
+    network, moving = Network(config), transition.REGISTRY[type(config.latent)](config)
     frames = {name: jax.ShapeDtypeStruct((1, *shape), BATCH_FIELDS[name][0]) for name, shape in inputs(config).items()}
     state, key = moving.initial_state(config, 1), jax.random.key(0)
     noise = StepNoise(state.stochastic, state.stochastic, jnp.zeros((1,), jnp.bool_))

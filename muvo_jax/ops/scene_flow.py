@@ -61,5 +61,5 @@ def _block(values: Array) -> Array:
     half = WINDOW_CELLS // 2
     wide = jnp.pad(values, ((0, 0), (half, half), (half, half)))
     x, y = values.shape[1:]
-    across = sum(wide[:, place:place + x] for place in range(WINDOW_CELLS))
-    return sum(across[:, :, place:place + y] for place in range(WINDOW_CELLS))
+    across = jnp.stack([wide[:, place:place + x] for place in range(WINDOW_CELLS)]).sum(axis=0)
+    return jnp.stack([across[:, :, place:place + y] for place in range(WINDOW_CELLS)]).sum(axis=0)

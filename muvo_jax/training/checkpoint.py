@@ -130,7 +130,7 @@ class Checkpoints:
 
         Raises:
           CheckpointError: where there are checkpoints but none can be read.
-          ValueError: where they belong to another architecture; names both.
+          ValueError: where they belong to another architecture, or other parameters trained; names both.
         """
         warnings: list[str] = []
         abstract = jax.tree.map(_abstract, like)
@@ -139,7 +139,7 @@ class Checkpoints:
             reason = integrity.damage(path)
             if reason is None:
                 meta = checkpoint_meta.read(path)
-                checkpoint_meta.check_architecture(config, config_lib.Config.from_dict(meta["config"]), str(path))
+                checkpoint_meta.check_resumable(config, config_lib.Config.from_dict(meta["config"]), str(path))
                 try:
                     state = self._restore(step, abstract, like)
                 except Exception as error:  # whatever Orbax raises: the checkpoint before may still be good

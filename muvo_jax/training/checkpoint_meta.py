@@ -12,6 +12,7 @@ from typing import Any
 import orbax.checkpoint as ocp
 
 from muvo_jax import config as config_lib
+from muvo_jax.config import settings
 
 SCHEMA_VERSION = 1
 _PACKAGES = ("muvo_jax", "jax", "jaxlib", "flax", "optax", "orbax-checkpoint", "numpy")
@@ -56,14 +57,25 @@ def check_architecture(wanted: config_lib.Config, stored: config_lib.Config, whe
 
     What an action does (model.kinematics) is the recording's, not the network's.
     """
-    ours, theirs = (dataclasses.asdict(config.model) | {"kinematics": None} for config in (wanted, stored))
+    ours, theirs = (settings.names(dataclasses.asdict(dataclasses.replace(config.model, kinematics=None)))
+                    for config in (wanted, stored))
     if ours == theirs:
         return
-    fields = [f"{name} {theirs[name]!r} (stored) against {ours[name]!r} (asked for)"
-              for name in ours if ours[name] != theirs[name]]
+    fields = [f"{name} {theirs.get(name, 'none')!r} (stored) against {ours.get(name, 'none')!r} (asked for)"
+              for name in {**ours, **theirs} if ours.get(name) != theirs.get(name)]
     raise ValueError(f"{where} holds another architecture: it is {stored.model.variant} of preset {stored.preset!r}, "
                      f"asked for is {wanted.model.variant} of preset {wanted.preset!r}. Different: "
                      f"{'; '.join(fields)}. Use the run's own settings, or a new --name.")
+
+
+def check_resumable(wanted: config_lib.Config, stored: config_lib.Config, where: str) -> None:
+    """As `check_architecture`, and ValueError where other parameters trained: the optimiser's state is of those."""
+    check_architecture(wanted, stored, where)
+    ours, theirs = wanted.train.trainable, stored.train.trainable
+    if ours != theirs:
+        raise ValueError(f"{where} was trained with train.trainable={theirs}, and cannot go on with {ours}: the "
+                         f"optimiser's state belongs to what trains. Start another run from its weights, with --init "
+                         f"and a new --name.")
 
 
 def package_versions() -> dict[str, str | None]:

@@ -1,4 +1,4 @@
-"""The average training frame as the start of the decoders (`model.first_guess = "training_mean"`, FirstGuess)."""
+"""The average training frame as the start of the decoders (config.TrainingMean, model/decoders.py)."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def fill(state: state_lib.TrainState, mean: baselines.TrainingMean, config: conf
          plan: parallel_lib.Plan) -> state_lib.TrainState:
     """`state` with the constants of `mean`, placed as `plan` says."""
     batch_stats = {**state.batch_stats}
-    if config.first_guess != "zero":
+    if not isinstance(config.first_guess, config_lib.ZeroGuess):
         batch_stats |= constants(mean, config)
     if config.action_path == "recurrence" and mean.action is not None:
         spread = np.sqrt(mean.action / mean.frames)

@@ -21,7 +21,17 @@ from muvo_jax import config as config_lib
 from muvo_jax import types
 from muvo_jax.data import fitting, pipeline, schema, sequences, words
 from muvo_jax.objectives import perceptual
-from muvo_jax.training import checkpoint, checkpoint_meta, host, preparation, run_folder, screen, start, validation
+from muvo_jax.training import (
+    checkpoint,
+    checkpoint_meta,
+    host,
+    preparation,
+    run_folder,
+    screen,
+    start,
+    trainable,
+    validation,
+)
 
 _STEPS_LATE = 4  # a step is looked at when so many later ones run: what it copied to the host has arrived by then
 
@@ -82,9 +92,10 @@ def train(job: Job, show: screen.Screen) -> Outcome:
       NonFiniteLossError: where the loss is not finite.
     """
     if job.resume:
-        checkpoint_meta.check_architecture(job.config, run_folder.read_config(job.folder), str(job.folder))
+        checkpoint_meta.check_resumable(job.config, run_folder.read_config(job.folder), str(job.folder))
     else:
         run_folder.check_new(job.folder, job.resume_command)
+    preparation.check_trainable(job.config)
     with concurrent.futures.ThreadPoolExecutor(1, "preparation") as background:
         early = background.submit(_prepare_early, job.config, job.frozen)
         config, recording, making_s = _open_data(job, show)
@@ -160,8 +171,13 @@ def _introduce(job: Job, show: screen.Screen, config: config_lib.Config, ready: 
     frame_s = data.stride / config.contract.rate_hz
     show.field("windows", f"{windows} of {data.frames} frames, {frame_s:g} s apart; then {data.context} observed and "
                           f"{data.horizon} imagined in evaluation")
-    show.field("model", f"{config.model.variant} ({config.model.latent}), {ready.parameters:,} parameters, heads "
+    show.field("model", f"{config.model.variant} ({config.model.latent.kind}), {ready.parameters:,} parameters, heads "
                         f"{', '.join(config.model.heads)}")
+    if config.train.trainable != trainable.EVERYTHING:
+        params = ready.state.params
+        trained, _ = trainable.split(params, trainable.chosen(params, config.train.trainable))
+        numbers = sum(leaf.size for leaf in jax.tree.leaves(trained))
+        show.field("trains", f"{numbers:,} parameters ({config.train.trainable}); the rest is frozen")
     extra = f" x {accumulate} accumulated" if accumulate > 1 else ""
     batch = words.counted(config.train.batch, "window")
     show.field("steps", f"{config.train.steps} of {batch}{extra}, {ready.step.plan.describe()}")

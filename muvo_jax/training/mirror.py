@@ -92,7 +92,7 @@ def check(model: config_lib.ModelConfig) -> None:
     if "occupancy" in drawn and abs(middle_m) > _SYMMETRIC_M:
         aside = f"the middle of model.voxels lies at y = {middle_m:g} m"
     lidar_m = model.range_view.position_m[1]
-    if (model.lidar != config_lib.NO_SENSOR or "range_view" in drawn) and abs(lidar_m) > _SYMMETRIC_M:
+    if (model.lidar is not None or "range_view" in drawn) and abs(lidar_m) > _SYMMETRIC_M:
         aside = f"the lidar (model.range_view.position_m) lies at y = {lidar_m:g} m"
     if aside:
         raise ValueError(f"augmentation.mirror=true exchanges left and right about the middle of the car, but {aside}. "

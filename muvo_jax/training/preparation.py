@@ -22,6 +22,7 @@ from muvo_jax.training import optimizer as optimizer_lib
 from muvo_jax.training import parallel as parallel_lib
 from muvo_jax.training import state as state_lib
 from muvo_jax.training import step as step_lib
+from muvo_jax.training import trainable
 
 
 @dataclasses.dataclass(frozen=True)
@@ -45,13 +46,13 @@ class Prepared:
 
     @property
     def parameters(self) -> int:
-        """How many numbers are learned."""
+        """How many numbers the model has, frozen ones included."""
         return sum(leaf.size for leaf in jax.tree.leaves(self.state.params))
 
     def with_variables(self, variables: types.Variables, config: config_lib.Config) -> state_lib.TrainState:
         """`state` with other variables of the same shapes and a fresh optimiser."""
         optimizer = optimizer_lib.make_optimizer(config.optimizer, config.train.steps)
-        state = state_lib.create(variables, optimizer, self.state.key)
+        state = state_lib.create(variables, optimizer, self.state.key, config.train.trainable)
         return parallel_lib.place_state(self.step.plan, state)
 
 
@@ -76,14 +77,21 @@ def expected_batch(config: config_lib.Config, windows: int, *,
         return jax.ShapeDtypeStruct((*prefix, *shape), dtype)
 
     fields = {name: timed(types.BATCH_FIELDS[name][0], *sizes) for name, sizes in world_model.inputs(model).items()}
-    if model.lidar != config_lib.NO_SENSOR:
+    if model.lidar is not None:
         fields["range_view"] = timed(np.float32, model.range_view.rows, model.range_view.columns, 4)
-    if model.camera != config_lib.NO_SENSOR or "image" in targets:
+    if model.camera is not None or "image" in targets:
         fields |= {"intrinsics": shape(np.float32, 3, 3), "camera_to_ego": shape(np.float32, 4, 4)}
     fields |= {name: timed(types.BATCH_FIELDS[name][0], *sizes) for name, sizes in targets.items()}
     fields |= {name: timed(types.BATCH_FIELDS[name][0]) for name in sorted(TOWN_RECORDS.intersection(recorded))}
     fields["action"] = timed(np.float32, 2)
     return types.Batch(is_first=timed(np.bool_), **fields)
+
+
+def check_trainable(config: config_lib.Config) -> None:
+    """Raises ValueError where train.trainable does not fit the model, before anything takes long."""
+    if config.train.trainable != trainable.EVERYTHING:
+        params = world_model.WorldModel(config.model).variable_shapes()["params"]
+        trainable.chosen(params, config.train.trainable)
 
 
 def prepare(config: config_lib.Config, batch_shapes: types.Batch,
@@ -96,7 +104,7 @@ def prepare(config: config_lib.Config, batch_shapes: types.Batch,
       frozen: the network of the perceptual term, where that is on.
 
     Raises:
-      ValueError: where the batch cannot be split over the devices.
+      ValueError: where the batch cannot be split over the devices, or train.trainable does not fit the model.
     """
     start_s = time.perf_counter()
     model = world_model.WorldModel(config.model)
@@ -105,7 +113,7 @@ def prepare(config: config_lib.Config, batch_shapes: types.Batch,
     example = jax.tree.map(lambda leaf: np.zeros((1, *leaf.shape[1:]), leaf.dtype), batch_shapes)
     variables = model.init(jax.random.fold_in(run_key, 0), example)
     optimizer = optimizer_lib.make_optimizer(config.optimizer, config.train.steps)
-    state = state_lib.create(variables, optimizer, jax.random.fold_in(run_key, 1))
+    state = state_lib.create(variables, optimizer, jax.random.fold_in(run_key, 1), config.train.trainable)
     state = jax.block_until_ready(parallel_lib.place_state(step.plan, state))
     initialised_s = time.perf_counter()
     placed = jax.tree.map(lambda leaf: np.zeros(leaf.shape, leaf.dtype), batch_shapes)

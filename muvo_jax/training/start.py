@@ -42,7 +42,7 @@ def first(init: pathlib.Path | None, pretrained: Pretrained | None, show: screen
         for note in notes:
             show.field("loaded", note)
         state = ready.with_variables(variables, config)
-    if config.model.first_guess != "zero" or config.model.action_path == "recurrence":
+    if not isinstance(config.model.first_guess, config_lib.ZeroGuess) or config.model.action_path == "recurrence":
         return first_guess.fill(state, validation.training_sums(frames), config.model, ready.step.plan)
     return state
 

@@ -21,7 +21,7 @@ from muvo_jax import types
 from muvo_jax.metrics import image as image_metrics
 from muvo_jax.model import rollout, world_model
 from muvo_jax.objectives import perceptual, total
-from muvo_jax.training import augmentation, light, mirror
+from muvo_jax.training import augmentation, light, mirror, trainable
 from muvo_jax.training import optimizer as optimizer_lib
 from muvo_jax.training import parallel as parallel_lib
 from muvo_jax.training import state as state_lib
@@ -62,8 +62,8 @@ def make_train_step(model: world_model.WorldModel, config: config_lib.Config, *,
     """Builds function(state, batch) -> (state, metrics); the state that goes in is donated.
 
     The metrics are float32 scalars: every loss term (unweighted), "total", "psnr_db" of the observed images,
-    "learning_rate", the norms "gradient_norm", "parameter_norm", "update_norm", and "finite" (1 or 0). An update that
-    is not finite is not applied, so the parameters stay usable; the step is counted.
+    "learning_rate", the norms "gradient_norm", "parameter_norm", "update_norm" of what trains, and "finite" (1 or 0).
+    An update that is not finite is not applied, so the parameters stay usable; the step is counted.
 
     Args:
       model: what is trained.
@@ -83,18 +83,18 @@ def make_train_step(model: world_model.WorldModel, config: config_lib.Config, *,
 
     def body(state, batch, axis_name):
         gradients, batch_stats, metrics = gradients_of(state, batch, axis_name)
-        gradients, params = optimizer_lib.pack(gradients), optimizer_lib.pack(state.params)
-        updates, opt_state = optimizer.update(gradients, state.opt_state, params)
-        gradient_norm = optax.global_norm(gradients)
+        trained, frozen_params = trainable.split(state.params, trainable.chosen(state.params, config.train.trainable))
+        updates, opt_state = optimizer.update(gradients, state.opt_state, trained)
+        gradient_norm = optimizer_lib.norm(gradients)
         finite = jnp.isfinite(metrics["total"]) & jnp.isfinite(gradient_norm)
-        before = (params, optimizer_lib.pack(state.batch_stats), state.opt_state)
-        after = (optax.apply_updates(params, updates), optimizer_lib.pack(batch_stats), opt_state)
-        packed, packed_stats, opt_state = jax.tree.map(lambda new, old: jnp.where(finite, new, old), after, before)
+        before = (trained, state.batch_stats, state.opt_state)
+        after = (optax.apply_updates(trained, updates), batch_stats, opt_state)
+        params, batch_stats, opt_state = jax.tree.map(lambda new, old: jnp.where(finite, new, old), after, before)
         metrics |= {"learning_rate": rate(state.step), "gradient_norm": gradient_norm,
-                    "parameter_norm": optax.global_norm(params), "update_norm": optax.global_norm(updates),
+                    "parameter_norm": optimizer_lib.norm(trained), "update_norm": optimizer_lib.norm(updates),
                     "finite": finite.astype(jnp.float32)}
-        return state.replace(step=state.step + 1, params=optimizer_lib.unpack(packed, state.params),
-                             batch_stats=optimizer_lib.unpack(packed_stats, batch_stats), opt_state=opt_state), metrics
+        return state.replace(step=state.step + 1, params=trainable.merge(params, frozen_params),
+                             batch_stats=batch_stats, opt_state=opt_state), metrics
 
     plan = parallel_lib.make_plan(parallel or config.train.parallel, config.train.batch, devices)
     return SpreadFunction(plan, config.optimizer.accumulate, parallel_lib.spread(plan, body, donate_state=True))
@@ -127,16 +127,22 @@ def gradient_body(model: world_model.WorldModel, config: config_lib.Config,
                   frozen: perceptual.FrozenEncoder | None = None) -> Callable:
     """Returns body(state, batch [accumulate, b, ...], axis_name) -> (gradients, batch_stats, metrics).
 
-    Gradients and metrics are means over micro-batches, equal on all devices; running statistics pass through the
-    micro-batches in order.
+    The gradients are a tree like the parameters, None where `config.train.trainable` freezes one. Gradients and
+    metrics are means over micro-batches, equal on all devices; running statistics pass through the micro-batches in
+    order.
     """
-    scored = functools.partial(forward, model=model, config=config, train=True, frozen=frozen)
+    def scored(trained, rest, *inputs, axis_name):
+        return forward(trainable.merge(trained, rest), *inputs, model=model, config=config, train=True,
+                       axis_name=axis_name, frozen=frozen)
+
     differentiate = jax.value_and_grad(scored, has_aux=True)
 
     def micro_step(state, batch_stats, batch, index, axis_name):
         keys = sample_keys(state.key, state.step, index, batch.batch_size, axis_name)
-        (_, (metrics, batch_stats)), gradients = differentiate(state.params, batch_stats, batch, keys,
-                                                               axis_name=axis_name)
+        trains = trainable.chosen(state.params, config.train.trainable)
+        with trainable.frozen_norms(trains):
+            (_, (metrics, batch_stats)), gradients = differentiate(
+                *trainable.split(state.params, trains), batch_stats, batch, keys, axis_name=axis_name)
         if axis_name is not None:
             gradients = jax.lax.pmean(gradients, axis_name)
         return batch_stats, gradients, metrics

@@ -6,6 +6,7 @@ import pytest
 import worlds
 
 from muvo_jax import command_line, plan_drive, presets
+from muvo_jax import config as config_lib
 from muvo_jax.agents import closed_loop, planners, sensitivity
 from muvo_jax.model import world_model
 from muvo_jax.town import settings
@@ -96,6 +97,23 @@ def test_the_planner_filters_every_step_plans_for_progress_and_compiles_once():
     assert plans.shape == (6, 4, 2) and states.features.shape[0] == 6 and memory is None
 
 
+def test_the_planner_stops_before_a_wall_unless_collisions_cost_nothing():
+    grid, bare = worlds.CONFIG.range_view, road(wall_m=16.0)
+
+    def observe(state):
+        return bare.observe(state) | {"range_view": np.full((grid.rows, grid.columns, 4), 16.0 - state[0], np.float32)}
+
+    world = dataclasses.replace(bare, observe=observe)
+    config, drives = planners.PlannerConfig(plans=48, iterations=6, std=0.7), {}
+    for collision in (5.0, 0.0):
+        environment, _ = worlds.before_a_wall(16.0, 5.0, 8, collision=collision)
+        driver = closed_loop.planning_driver(world, environment, {}, config=config, horizon=8)
+        drives[collision] = run(world, driver, steps=25)
+    assert drives[0.0].end.collided
+    assert drives[5.0].unharmed and drives[5.0].steps == 25
+    assert drives[5.0].progress_m > 7.0  # it drove on to where the wall was near
+
+
 @pytest.mark.parametrize(("options", "message"), [
     ({"planner": "a-star"}, "planner 'a-star' is unknown; known are cem, mppi, gradient"),
     ({"horizon": 0}, "horizon is 0"),
@@ -119,7 +137,7 @@ def test_the_town_gives_what_the_model_reads_at_the_models_rate():
     assert seen["image"].shape == (*config.model.image_size, 3) and seen["image"].dtype == np.uint8
     assert seen["range_view"].shape == (config.model.range_view.rows, config.model.range_view.columns, 4)
     assert seen["route_map"].shape == (64, 64)
-    lifted = dataclasses.replace(config, model=dataclasses.replace(config.model, camera="bev"))
+    lifted = config_lib.override(config, "model.camera", "bev")
     assert set(plan_drive.observation(town, state, lifted)) >= set(world_model.inputs(lifted.model))
 
 

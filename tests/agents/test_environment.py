@@ -8,6 +8,8 @@ import numpy as np
 import pytest
 from worlds import CONFIG, HORIZON, MODEL, NO_COLLISION, STARTS, bank, make, variables
 
+from muvo_jax import config as config_lib
+from muvo_jax import presets
 from muvo_jax.agents import environment as environment_lib
 from muvo_jax.agents import rewards
 from muvo_jax.model import rollout, world_model
@@ -41,7 +43,8 @@ def test_without_noise_a_step_is_the_models_and_the_car_moves_by_its_kinematics(
 
 
 def test_the_2d_latent_is_driven_by_a_policy_that_reads_one_vector():
-    model = world_model.WorldModel(dataclasses.replace(CONFIG, latent="2d", heads=("action",)))
+    model = world_model.WorldModel(config_lib.override_all(presets.get("tiny"), {
+        "model.latent": "2d", "model.heads": ("action",)}).model)
     draw = lambda leaf: jax.random.normal(jax.random.key(leaf.size), leaf.shape)
     starts = environment_lib.StartBank(jax.tree.map(draw, model.initial_state(STARTS)), bank().speed_mps,
                                        bank().route_map)
@@ -76,7 +79,7 @@ def test_many_cars_restart_one_by_one():
 
 
 def test_gradients_reach_actions_and_a_predicted_collision_ends_the_drive():
-    config = rewards.RewardConfig(terminal_collision=0.0, occupancy_scale=4)
+    config = rewards.RewardConfig(terminal_collision=0.0, occupancy_scale=2)
     environment, params = make(reward_config=config)
     assert environment.decoded_heads == ("occupancy",)
     _, state = environment.reset(jax.random.key(0), params)
@@ -88,6 +91,18 @@ def test_gradients_reach_actions_and_a_predicted_collision_ends_the_drive():
     (_, transitions), gradient = jax.value_and_grad(total, has_aux=True)(jnp.zeros((2, 2)))
     assert transitions.terminated.all() and not transitions.truncated.any()
     assert np.isfinite(gradient).all() and np.abs(gradient).max() > 0
+
+
+def test_by_default_a_model_at_even_odds_ends_no_drive():
+    environment, params = make(reward_config=rewards.RewardConfig())
+    params = dataclasses.replace(params, variables=jax.tree.map(jnp.zeros_like, params.variables))
+    _, states = jax.vmap(environment.reset, (0, None))(jax.random.split(jax.random.key(0), 4), params)
+    _, transitions = jax.vmap(environment.step, (0, 0, None, None))(
+        jax.random.split(jax.random.key(1), 4), states, ACTION, params)
+    np.testing.assert_allclose(transitions.terms["collision"], 0.5, atol=1e-3)
+    assert not transitions.terminated.any()
+    with pytest.raises(ValueError, match="holds the road"):
+        make(reward_config=rewards.RewardConfig(occupancy_scale=4))
 
 
 def test_the_bank_holds_every_frame_after_the_first_ones():

@@ -1,6 +1,7 @@
 """Ego path and rewards: worked arithmetic."""
 
 import dataclasses
+import itertools
 
 import jax
 import jax.numpy as jnp
@@ -8,7 +9,7 @@ import numpy as np
 import pytest
 
 from muvo_jax import config as config_lib
-from muvo_jax.agents import rewards
+from muvo_jax.agents import rewards, route
 from muvo_jax.ops import motion as motion_ops
 from muvo_jax.town import renderer, simulator
 
@@ -22,6 +23,36 @@ def moment(speed=10.0, action=(0.0, 0.0), **fields):
     action = jnp.asarray(action, jnp.float32)
     return rewards.Moment(before, motion_ops.drive(before, action, CONTRACT, 2), action, jnp.zeros((3,)),
                           **{"decoded": {}} | fields)
+
+
+def map_of(line_m):
+    """The line of a map on which the town draws a route of points [N, 2] in the ego frame."""
+    drawn = renderer.draw_route(np.asarray(line_m, float), np.zeros(3))
+    return route.follow(jnp.asarray(drawn), config_lib.RouteMap())
+
+
+LINE_Y_M = -0.375  # where the map's pixels have the middle of a line at y = 0
+STRAIGHT = map_of(np.stack([np.arange(-15, 45, 0.5), np.zeros(120)], axis=1))
+
+
+def driven(poses, speed=10.0, line=STRAIGHT, config=CONFIG, **fields):
+    """(rewards [H], terms) of a car that is led through poses [H + 1, 3] at a speed, with a clear road."""
+    poses = jnp.asarray(poses, jnp.float32)
+    motion = lambda part: motion_ops.Motion(part, jnp.full(part.shape[:1], speed, jnp.float32))
+    steps = rewards.Moment(motion(poses[:-1]), motion(poses[1:]), jnp.zeros((len(poses) - 1, 2)), jnp.zeros((3,)), {},
+                           route=line, **fields)
+    reward, _, terms = rewards.weighed(steps, None, contract=CONTRACT, step_s=0.2, config=config)
+    return np.asarray(reward), {name: np.asarray(term) for name, term in terms.items()}
+
+
+def through(*corners, step_m=2.0):
+    """Poses every step_m along straight stretches between corners [x, y]."""
+    stretches = []
+    for start, end in itertools.pairwise(corners):
+        start, end = np.array(start, float), np.array(end, float)
+        yaw, count = np.arctan2(*(end - start)[::-1]), round(np.linalg.norm(end - start) / step_m)
+        stretches += [[*(start + (end - start) * k / count), yaw] for k in range(count)]
+    return np.array([*stretches, [*corners[-1], yaw]])
 
 
 def logits(occupied):
@@ -64,6 +95,13 @@ def test_only_what_stands_at_the_height_of_the_car_counts():
     assert np.argwhere(plan > 0.5).tolist() == [[5, 6]]
 
 
+def test_what_begins_where_the_car_ends_is_no_collision():
+    beside = rewards.obstacle_plan(logits([(x, 9, 2) for x in range(16)]), GRID, CONFIG.box)  # from y = 1 m on
+    touched = rewards.box_collision(beside, jnp.array([[0.0, 0.0, 0.0], [0.0, 0.5, 0.0]]), GRID, CONFIG.box)
+    np.testing.assert_allclose(touched, [0.25, 0.75], atol=1e-3)
+    assert touched[0] < CONFIG.tolerated_collision
+
+
 @pytest.mark.parametrize("voxel, pose, expected", [
     ((10, 8, 2), (0, 0, 0), 1.0),  # 2.5 m ahead, 0.5 m to the left: inside the box
     ((13, 8, 2), (0, 0, 0), 0.0),  # 5.5 m ahead: out of reach
@@ -73,8 +111,35 @@ def test_only_what_stands_at_the_height_of_the_car_counts():
 ])
 def test_the_ego_box_touches_what_lies_under_it(voxel, pose, expected):
     plan = rewards.obstacle_plan(logits([voxel]), GRID, CONFIG.box)
-    probability = rewards.box_collision(plan, jnp.asarray(pose, jnp.float32), GRID, CONFIG.box)
-    np.testing.assert_allclose(probability, expected, atol=0.45)  # bilinear, half a voxel apart
+    probability = rewards.box_collision(plan, jnp.asarray(pose, jnp.float32)[None], GRID, CONFIG.box)
+    np.testing.assert_allclose(probability, [expected], atol=0.45)  # bilinear, half a voxel apart
+
+
+def test_a_collision_is_seen_where_the_car_will_be():
+    wall = lambda speed, action=(0.0, 0.0): rewards.collision(  # 5 to 6 m ahead; the bumper is at 3.7 m
+        moment(speed, action, decoded={"occupancy": logits([(13, y, 2) for y in range(16)])}), GRID, CONFIG)
+    assert wall(1.0) < 0.1  # 0.4 m on
+    assert wall(6.0) > 0.6  # 2.4 m on
+    assert wall(1.0, (-1.0, 0.0)) < 0.1 and wall(0.0) < 0.1
+    bend = rewards.poses_ahead(jnp.zeros(3), moment(5.0).before, moment(5.0, (0.0, -0.5)).after, 0.4)
+    np.testing.assert_allclose(bend[:, 2], 5.0 * np.array([0.0, 0.2, 0.4]) * np.tan(0.3) / 2.9, rtol=1e-3)
+    assert np.all(np.diff(bend[:, 1]) > 0)  # to the left
+
+
+def test_coarse_occupancy_is_read_as_it_was_trained():
+    # Half the size in cells of 2 m: cell [5, 4] covers x from 2 to 4 m and y from 0 to 2 m; its layer 1 0.5 to 2.5 m.
+    coarse = jnp.full((8, 8, 2, 2), 0.0).at[..., 0].set(40.0).at[5, 4, 1].set(jnp.array([0.0, 40.0]))
+    places = jnp.array([[0.0, 0.0, 0.0], [0.0, 1.9, 0.0]])
+    point = rewards.EgoBox(rear_m=2.9, front_m=3.1, half_width_m=0.1)
+    where = lambda pooled: rewards.box_collision(rewards.obstacle_plan(coarse, GRID, CONFIG.box, pooled=pooled), places,
+                                                 GRID, point, pooled=pooled)
+    np.testing.assert_allclose(rewards.centres_m(8, 0, GRID, pooled=True)[0][5], 3.0)  # any of its voxels
+    np.testing.assert_allclose(rewards.centres_m(8, 0, GRID, pooled=False)[0][5], 2.5)  # its first voxel alone
+    np.testing.assert_allclose(where(True), [0.51, 0.56], atol=0.02)  # the cell's middle is at y = 1 m
+    np.testing.assert_allclose(where(False), [0.60, 0.25], atol=0.02)  # 0.4 m beyond it, and 0.4 m or 1.3 m beside
+    assert rewards.obstacle_layers(2, GRID, CONFIG.box).tolist() == [1]
+    with pytest.raises(ValueError, match=r"in 1 layers.* from -1\.5 to 2\.5 m and holds the road.*occupancy_scale"):
+        rewards.obstacle_layers(1, GRID, CONFIG.box)
 
 
 def test_bilinear_by_hand():
@@ -83,21 +148,78 @@ def test_bilinear_by_hand():
     np.testing.assert_allclose(sampled, [4.0, 3.0, 2.0, 2.0, 0.0])
 
 
-def test_route_geometry_is_the_towns():
-    route = rewards.RouteMap()
-    assert route.metres_per_px == renderer.ROUTE_MAP_M_PER_PX and route.ego_row == renderer.ROUTE_MAP_EGO_ROW
-    line = np.stack([np.arange(-10, 30, 0.5), np.full(80, 4.0)], axis=1)  # 4 m to the left
-    drawn = jnp.asarray(renderer.draw_route(line, np.zeros(3)))
-    for y, expected in ((4.0, 0.0), (0.0, 4.0), (9.0, 5.0)):  # the line is three pixels wide: up to 1.5 m nearer
-        distance = rewards.route_distance_m(drawn, jnp.array([10.0, y, 0.3]), route)
-        assert max(expected - 1.6, 0) <= distance <= expected + 0.6
+def test_the_line_of_a_map_is_the_towns_route():
+    scale = config_lib.RouteMap()
+    assert scale.metres_per_px == renderer.ROUTE_MAP_M_PER_PX and scale.ego_row == renderer.ROUTE_MAP_EGO_ROW
+    bend = np.linspace(0, np.pi / 2, 40)
+    turn = np.stack([10 + 12 * np.sin(bend), -12 * (1 - np.cos(bend))], axis=1)  # to the right, from 10 m ahead on
+    line_m = np.concatenate([np.stack([np.arange(-12, 10, 0.5), np.zeros(44)], 1), turn, turn[-1] - [[0, 8], [0, 16]]])
+    line = map_of(line_m)
+    points, along = np.asarray(line.points_m)[line.known], np.asarray(line.along_m)[line.known]
+    dense = np.concatenate([np.linspace(a, b, 20) for a, b in itertools.pairwise(line_m)])
+    assert np.linalg.norm(points[:, None] - dense[None], axis=-1).min(axis=1).max() < 1.3
+    assert along[0] < -8 and along[-1] > 10 + 12 * np.pi / 2 + 8 and (np.diff(along) > 0).all()
+    at, away = route.place(line, jnp.array([[5.0, 0.0, 0.0], [-5.0, 1.0, 0.0], [22.0, -20.0, -1.6]]))
+    np.testing.assert_allclose(at, [5.0, -5.0, 10 + 12 * np.pi / 2 + 8], atol=1.5)
+    np.testing.assert_allclose(away, [0.0, 1.0, 0.0], atol=0.6)
+
+
+def test_without_a_painted_pixel_nothing_is_gained():
+    empty = route.follow(jnp.zeros((64, 64), jnp.uint8), config_lib.RouteMap())
+    assert not empty.known.any()
+    reward, terms = driven(through((0, 0), (20, 0)), line=empty)
+    np.testing.assert_array_equal(terms["progress_m"], 0.0)
+    assert np.isfinite(reward).all()
 
 
 def test_progress_fades_with_the_distance_from_the_route():
-    np.testing.assert_allclose(rewards.progress_m(moment(), CONFIG), 2.0, rtol=1e-5)  # 10 m/s for 0.2 s
-    route_map = jnp.zeros((64, 64), jnp.uint8).at[:, 35].set(255)  # its centre is 3.5 px = 2.625 m to the right
-    away = rewards.progress_m(moment(route_map=route_map), CONFIG)
-    np.testing.assert_allclose(away, 2.0 * np.exp(-0.5 * (2.625 / 2) ** 2), rtol=0.02)
+    _, on = driven(through((0, 0), (20, 0)))
+    np.testing.assert_allclose(on["progress_m"], 2.0, rtol=0.02)
+    _, beside = driven(through((0, 2.6), (20, 2.6)))
+    away = route.place(STRAIGHT, jnp.array([10.0, 2.6, 0.0]))[1]
+    np.testing.assert_allclose(away, 2.6, atol=0.4)  # half a pixel
+    np.testing.assert_allclose(beside["progress_m"][2:], 2.0 * np.exp(-0.5 * (away / 2) ** 2), rtol=0.02)
+
+
+def test_driving_back_along_the_painted_route_loses_what_driving_on_gains():
+    on, back = (driven(through((0, LINE_Y_M), (end, LINE_Y_M)))[0] for end in (10, -10))
+    np.testing.assert_allclose(on, 1.0, rtol=0.05)
+    np.testing.assert_allclose(back, -1.0, rtol=0.05)
+    _, terms = driven(through((0, 0), (-10, 0)), line=None)  # no map: along the heading of the start
+    np.testing.assert_allclose(terms["progress_m"], -2.0, rtol=1e-3)
+
+
+def test_standing_still_earns_nothing_and_any_drive_along_the_route_more():
+    still, _ = driven(np.zeros((6, 3)), speed=0.0)
+    np.testing.assert_allclose(still, 0.0, atol=1e-6)
+    for speed in (1.0, 5.0, 10.0):
+        assert driven(through((0, 0), (12, 0), step_m=0.2 * speed), speed)[0].min() > 0.05
+
+
+@pytest.mark.parametrize("line", [STRAIGHT, None], ids=["route", "no map"])
+def test_circling_earns_nothing(line):
+    angle = np.linspace(0, 2 * np.pi, 21)
+    circle = np.stack([6 * np.sin(angle), 6 * (1 - np.cos(angle)), angle], axis=1)
+    reward, terms = driven(circle, line=line)
+    assert terms["progress_m"].sum() < 0.1 and reward.sum() < 0.1
+    aside = driven(through((0, 0), (12, 0), (12, 8), (0, 8), (0, 0)), line=line)[1]  # back where nothing fades
+    assert aside["progress_m"].sum() < 0.1
+
+
+def test_leaving_and_rejoining_the_route_never_pays():
+    straight = driven(through((0, 0), (24, 0)))[1]["progress_m"].sum()
+    detour = driven(through((0, 0), (6, 0), (12, 6), (18, 0), (24, 0)))[1]["progress_m"].sum()
+    again = driven(through((0, 0), (12, 0), (12, 6), (4, 6), (4, 0), (24, 0)))[1]["progress_m"].sum()
+    np.testing.assert_allclose(straight, 24.0, atol=0.5)
+    assert detour < 0.8 * straight and again < straight
+
+
+@pytest.mark.parametrize("weight", [0.1, 1.0, 3.0])
+def test_the_limit_is_the_best_speed_whatever_speeding_costs(weight):
+    config = dataclasses.replace(CONFIG, speeding=weight)
+    earned = {speed: driven(through((0, 0), (24, 0), step_m=0.2 * speed), speed, config=config)[0].mean()
+              for speed in (8.0, 9.0, 10.0, 12.0, 15.0, 20.0)}
+    assert max(earned, key=earned.get) == 10.0 and earned[20.0] < earned[15.0] < earned[10.0] - 0.2 * weight
 
 
 def test_comfort_and_speeding_by_hand():
@@ -109,20 +231,25 @@ def test_comfort_and_speeding_by_hand():
 
 
 def test_the_reward_adds_up_and_ends_at_a_collision():
-    whole = lambda occupied: rewards.driving_reward(
-        moment(5.0, decoded={"occupancy": logits(occupied)}), grid=GRID, contract=CONTRACT, step_s=0.2, config=CONFIG)
-    reward, terminated, _ = whole([])
+    whole = lambda occupancy: rewards.driving_reward(
+        moment(5.0, decoded={"occupancy": occupancy}), grid=GRID, contract=CONTRACT, step_s=0.2, config=CONFIG)
+    reward, terminated, _ = whole(logits([]))
     np.testing.assert_allclose(reward, 0.5, rtol=1e-4)  # 1 m of the 2 m that the limit allows
     assert not terminated
-    reward, terminated, terms = whole([(10, 8, 2)])
-    np.testing.assert_allclose(reward, 0.5 - 5.0 * terms["collision"], rtol=1e-4)
+    reward, terminated, terms = whole(logits([(10, 8, 2), (10, 7, 2), (11, 8, 2), (11, 7, 2)]))
+    np.testing.assert_allclose(reward, 0.5 - 20.0 * (terms["collision"] - 0.3) / 0.7, rtol=1e-4)
     assert terminated
+    reward, terminated, _ = whole(jnp.zeros((*GRID.shape, 2)))  # as likely as not, everywhere: an untrained model
+    np.testing.assert_allclose(reward, 0.5 - 20.0 * 0.2 / 0.7, rtol=1e-4)
+    assert not terminated
 
 
 def test_gradients_push_the_car_away_from_obstacles_and_towards_the_route():
     plan = rewards.obstacle_plan(logits([(12, 8, 2)]), GRID, CONFIG.box)  # centre 4.5 m ahead, the bumper at 3.7 m
-    touch = lambda pose: rewards.box_collision(plan, pose, GRID, CONFIG.box)
+    touch = lambda pose: rewards.box_collision(plan, pose[None], GRID, CONFIG.box)[0]
     assert jax.grad(touch)(jnp.array([0.2, 0.0, 0.0]))[0] > 0  # driving on makes it worse
-    route_map = jnp.zeros((64, 64), jnp.uint8).at[:, 20].set(255)
-    away = lambda pose: rewards.route_distance_m(route_map, pose, CONFIG.route)
-    assert jax.grad(away)(jnp.zeros(3))[1] < 0
+    line = map_of(np.stack([np.arange(-15, 45, 0.5), np.full(120, -4.0)], axis=1))
+    away = lambda pose: route.place(line, pose)[1]
+    assert jax.grad(away)(jnp.zeros(3))[1] > 0  # the route is to the right
+    along = jax.grad(lambda x: route.place(STRAIGHT, jnp.array([1.0, 0.0, 0.0]) * x)[0])(2.0)
+    np.testing.assert_allclose(along, 1.0, rtol=0.02)

@@ -27,7 +27,7 @@ NAN = float("nan")
 
 @pytest.fixture(scope="module")
 def world():
-    model = WorldModel(dataclasses.replace(CONFIG.model, lidar="none", heads=("image", "action")))
+    model = WorldModel(dataclasses.replace(CONFIG.model, lidar=None, heads=("image", "action")))
     variables = model.init(jax.random.key(0))
     environment = environment_lib.Environment.of_run(Run(model, variables, CONFIG),
                                                      reward_config=rewards.RewardConfig(collision=0.0))

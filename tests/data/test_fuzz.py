@@ -3,6 +3,7 @@
 import shutil
 import warnings
 
+import nuscenes_writer
 import pytest
 import recording_samples as samples
 import recording_writers as writers
@@ -17,6 +18,10 @@ PLAIN = ("recording.toml", "train/a/frames.csv", "train/a/image/000000.png", "tr
 KITTI = ("calib_cam_to_cam.txt", "calib_velo_to_cam.txt", f"{writers.DRIVE}/image_02/timestamps.txt",
          f"{writers.DRIVE}/image_02/data/0000000000.png", f"{writers.DRIVE}/velodyne_points/data/0000000000.bin",
          f"{writers.DRIVE}/oxts/data/0000000000.txt")
+NUSCENES = (*(f"v1.0-mini/{name}.json" for name in ("scene", "sample", "sensor", "calibrated_sensor", "sample_data",
+                                                   "ego_pose")),
+            "samples/CAM_FRONT/n000__CAM_FRONT__1532402927612460.jpg",
+            f"samples/LIDAR_TOP/n000__LIDAR_TOP__{nuscenes_writer.START_US}.pcd.bin")
 CARLA = ("pd_dataframe.pkl", "image/image_000000010.png", "points_semantic/points_semantic_000000010.npy",
          "voxel/voxel_000000010.npy", "routemap/routemap_000000010.png")
 
@@ -74,6 +79,11 @@ def kitti_root(tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
+def nuscenes_root(tmp_path_factory):
+    return nuscenes_writer.write(tmp_path_factory.mktemp("nuscenes") / "set", turns=11)
+
+
+@pytest.fixture(scope="module")
 def carla_root(tmp_path_factory):
     if samples.MUVO_LAYOUT is None:
         pytest.skip("no recording in the MUVO layout here; name one by MUVO_LAYOUT=FOLDER")
@@ -96,6 +106,13 @@ def test_plain(plain_root, name, changes):
 @given(changes=edits)
 def test_kitti(kitti_root, name, changes):
     assert names_what_is_wrong(refusal_when_changed(kitti_root, name, changes), kitti_root)
+
+
+@pytest.mark.parametrize("name", NUSCENES)
+@FUZZ
+@given(changes=edits)
+def test_nuscenes(nuscenes_root, name, changes):
+    assert names_what_is_wrong(refusal_when_changed(nuscenes_root, name, changes), nuscenes_root)
 
 
 @pytest.mark.parametrize("name", CARLA)

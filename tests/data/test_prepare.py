@@ -88,7 +88,7 @@ def test_recorded_voxels_route_and_contract_are_used(plain_recording):
 
 def test_a_small_recorded_grid_gets_a_shallower_voxel_decoder(plain_recording):
     config, notes = fitting.adapt(presets.get("paper-occupancy"), plain_recording)
-    assert config.model.occupancy_blocks == 1 and any("voxel decoder" in note for note in notes)
+    assert config.model.latent.occupancy_blocks == 1 and any("voxel decoder" in note for note in notes)
     odd = config_lib.VoxelGrid(shape=(20, 16, 16))
     with pytest.raises(schema.DataError, match=r"20x16x16 .*multiple of 8"):
         fitting.adapt(presets.get("tiny"), with_description(plain_recording, voxels=odd))
@@ -105,7 +105,7 @@ def test_a_model_without_the_sensor_that_a_recording_lacks(plain_recording):
     tiny, modalities = presets.get("tiny"), plain_recording.description.modalities
     blind = with_description(plain_recording, modalities=modalities - {"image", "intrinsics"}, camera=None)
     config, notes = fitting.adapt(tiny, blind)
-    assert (config.model.camera, config.model.lidar) == ("none", "rv")
+    assert config.model.camera is None and config.model.lidar == tiny.model.lidar
     assert config.model.heads == ("range_view", "occupancy", "action")
     assert "no images are recorded: the model has no camera input and no head image." in notes
     assert fitting.adapt(config, blind).config == config
@@ -113,7 +113,7 @@ def test_a_model_without_the_sensor_that_a_recording_lacks(plain_recording):
     assert not {"image", "intrinsics", "camera_to_ego"} & prepare.prepare_frame(raw, config).keys()
 
     config, _ = fitting.adapt(tiny, with_description(plain_recording, modalities=modalities - {"points_m"}))
-    assert (config.model.camera, config.model.lidar) == ("wob", "none")
+    assert config.model.camera == tiny.model.camera and config.model.lidar is None
     assert config.model.heads == ("image", "occupancy", "action")  # occupancy is recorded
     config, notes = fitting.adapt(tiny, with_description(plain_recording, modalities=modalities - {
         "points_m", "occupancy"}, lidar=None, voxels=None))

@@ -1,6 +1,5 @@
 """From a checkpoint of the authors to a run and back, without torch; what does not fit is named and leaves nothing."""
 
-import dataclasses
 import json
 import resource
 import time
@@ -19,8 +18,9 @@ from muvo_jax.model import world_model
 from muvo_jax.training import checkpoint, screen
 
 # The tiny preset, with two things that no checkpoint tells as they are by default.
-TINY = dataclasses.replace(presets.get("tiny").model, numerics="reference", transformer_heads=8, token_channels=24,
-                           image_size=(64, 128), range_view=config_lib.RangeViewGeometry(rows=64, columns=64))
+TINY = config_lib.override_all(presets.get("tiny"), {
+    "model.numerics": "reference", "model.fusion.heads": 8, "model.fusion.token_channels": 24,
+    "model.image_size": (64, 128), "model.range_view": config_lib.RangeViewGeometry(rows=64, columns=64)})
 
 
 def drawn_variables(config):
@@ -46,12 +46,12 @@ def checkpoint_of(state_dict):
 
 
 @pytest.fixture(scope="module", params=[
-    {}, {"latent": "2d", "backbone": "mobilevitv2_100"},
-    {"lidar": "pp", "camera": "bev", "fusion": "fc", "navigation": True,
-     "heads": ("image", "range_view", "action", "birds_eye")}], ids=["1d", "2d-mobilevit", "fc"])
+    {}, {"model.latent": "2d", "model.backbone": "mobilevitv2_100"},
+    {"model.lidar": "pp", "model.camera": "bev", "model.fusion": "fc", "model.navigation": True,
+     "model.heads": ("image", "range_view", "action", "birds_eye")}], ids=["1d", "2d-mobilevit", "fc"])
 def tiny(request):
     """Configuration, variables and state_dict of a small model."""
-    config = dataclasses.replace(TINY, **request.param)
+    config = config_lib.override_all(TINY, request.param).model
     variables = drawn_variables(config)
     return config, variables, names.reference_state_dict(variables, config)
 
@@ -99,7 +99,7 @@ def test_half_precision_of_the_old_format(tiny, tmp_path):
     (lambda state: (state.clear(), state.update({"fc.weight": np.zeros((2, 2), np.float32)})), r"such as fc\.weight"),
 ])
 def test_what_does_not_fit_is_named_and_leaves_no_folder(damage, message, tmp_path):
-    state_dict = names.reference_state_dict(drawn_variables(TINY), TINY)
+    state_dict = names.reference_state_dict(drawn_variables(TINY.model), TINY.model)
     damage(state_dict)
     torch_writer.write_zip(tmp_path / "a.ckpt", {"state_dict": torch_writer.tensors(
         {f"model.{key}": value for key, value in state_dict.items()})})
@@ -120,7 +120,7 @@ def test_a_checkpoint_without_tensors_and_an_occupied_folder(tmp_path):
 
 
 def test_weights_that_are_not_finite_are_said(tmp_path, capsys):
-    state_dict = names.reference_state_dict(drawn_variables(TINY), TINY)
+    state_dict = names.reference_state_dict(drawn_variables(TINY.model), TINY.model)
     state_dict["policy.fc.6.bias"] = np.array([np.nan, 0.0], np.float32)
     torch_writer.write_zip(tmp_path / "a.ckpt", checkpoint_of(state_dict))
     run_convert(tmp_path / "a.ckpt", tmp_path / "run")
@@ -141,7 +141,7 @@ def test_a_full_disk_is_named_and_leaves_no_folder(tmp_path, monkeypatch):
 @pytest.mark.slow
 def test_a_converted_run_is_judged_dreams_and_trains_on(tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    state_dict = names.reference_state_dict(drawn_variables(TINY), TINY)
+    state_dict = names.reference_state_dict(drawn_variables(TINY.model), TINY.model)
     torch_writer.write_zip(tmp_path / "a.ckpt", checkpoint_of(state_dict))
     run_convert(tmp_path / "a.ckpt", tmp_path / "run")
     judged = evaluate.evaluate(evaluate.Options(tmp_path / "run", splits=("val_rl",), windows=1, batch=1),

@@ -1,6 +1,5 @@
 """What float32 decides by chance is told by magnitude and noise, whatever an entry is called."""
 
-import types
 
 import jax
 import jax.numpy as jnp
@@ -113,14 +112,14 @@ def test_a_chamfer_gradient_is_known_as_far_as_expanded_squares_are(tmp_path):
 def test_the_choice_of_depth_bins_that_the_pack_made_is_kept_for_what_follows(tmp_path):
     """An embedding that jumps with a weight's rounding: the first that agrees with the file is the one that goes on."""
     encode = lambda weights: jnp.where(weights["a"] > 1.0, 2.0, 1.0)[None]
-    config = types.SimpleNamespace(camera="bev", latent="1d")
+    config = config_lib.ModelConfig(camera=config_lib.BirdsEyeCamera())
     weights = {"a": np.float32(1.0)}
     for stored in (1.0, 2.0):
         context = cases.Context(file_of(tmp_path, embedding=[stored]), golden.Settings())
         embedding, check = full_models._encoded(context, config, encode, weights)
         np.testing.assert_array_equal(embedding, [stored])
         assert ("as first rounded" in check.note) == (stored == 2.0)
-    plane = config_lib.ModelConfig(camera="wob")
+    plane = config_lib.ModelConfig()
     embedding, check = full_models._encoded(context, plane, encode, weights)
     np.testing.assert_array_equal(embedding, [1.0])
     assert check.note == ""

@@ -11,25 +11,27 @@ from muvo_jax.interop import checkpoints, names
 from muvo_jax.interop.parity import golden
 
 LIDAR_ONLY = ("range_view", "action")
+BEV, PP = {"camera": config_lib.BirdsEyeCamera()}, {"lidar": config_lib.PillarLidar()}
+FC, TOKENS = {"fusion": config_lib.ConcatenationFusion()}, {"latent": config_lib.TokenLatent()}
 VARIANTS = {
     "1d_RV_WOB_TR_voxel": {"heads": config_lib.HEADS},
     "1d_RV_WOB_TR_novoxel": {"heads": ("image", "range_view", "action")},
-    "RV_BEV_TR": {"camera": "bev"},
-    "PP_WOB_TR": {"lidar": "pp"},
-    "PP_BEV_TR": {"lidar": "pp", "camera": "bev"},
-    "RV_WOB_FC": {"fusion": "fc"},
-    "PP_WOB_FC": {"fusion": "fc", "lidar": "pp"},
-    "RV_BEV_FC": {"fusion": "fc", "camera": "bev"},
-    "PP_BEV_FC": {"fusion": "fc", "lidar": "pp", "camera": "bev"},
-    "RV_WOB_TR_LARGE": {"many_tokens": True},
+    "RV_BEV_TR": BEV,
+    "PP_WOB_TR": PP,
+    "PP_BEV_TR": {**PP, **BEV},
+    "RV_WOB_FC": FC,
+    "PP_WOB_FC": {**FC, **PP},
+    "RV_BEV_FC": {**FC, **BEV},
+    "PP_BEV_FC": {**FC, **PP, **BEV},
+    "RV_WOB_TR_LARGE": {"fusion": config_lib.TransformerFusion(many_tokens=True)},
     "RV_WOB_TR_measurements": {"navigation": True},
-    "RV_BEV_FC_measurements": {"fusion": "fc", "camera": "bev", "navigation": True},
-    "2d_RV_WOB_TR_voxel": {"latent": "2d", "heads": config_lib.HEADS},
-    "2d_RV_BEV_TR": {"latent": "2d", "camera": "bev"},
-    "2d_PP_WOB_TR": {"latent": "2d", "lidar": "pp"},
-    "2d_measurements": {"latent": "2d", "navigation": True},
-    "2d_bevseg": {"latent": "2d", "heads": ("range_view", "action", "birds_eye")},
-    "2d_mobilevit": {"latent": "2d", "backbone": "mobilevitv2_100", "heads": config_lib.HEADS},
+    "RV_BEV_FC_measurements": {**FC, **BEV, "navigation": True},
+    "2d_RV_WOB_TR_voxel": {**TOKENS, "heads": config_lib.HEADS},
+    "2d_RV_BEV_TR": {**TOKENS, **BEV},
+    "2d_PP_WOB_TR": {**TOKENS, **PP},
+    "2d_measurements": {**TOKENS, "navigation": True},
+    "2d_bevseg": {**TOKENS, "heads": ("range_view", "action", "birds_eye")},
+    "2d_mobilevit": {**TOKENS, "backbone": "mobilevitv2_100", "heads": config_lib.HEADS},
 }
 
 
@@ -60,5 +62,5 @@ def test_variants_are_recognised_by_their_keys_and_shapes(name):
 
 def test_the_grid_of_a_birds_eye_camera_comes_from_the_checkpoint():
     matrix = np.array([[2.0, 0, 16], [0, -2.0, 32], [0, 0, 1]], np.float32)
-    grid = checkpoints.recognise(stored("RV_BEV_FC", **{"frustum_pooling.bev_intrinsics": matrix})).birds_eye
+    grid = checkpoints.recognise(stored("RV_BEV_FC", **{"frustum_pooling.bev_intrinsics": matrix})).camera.grid
     assert (grid.cells, grid.cell_m, grid.cells_behind) == (64, 0.5, 16)

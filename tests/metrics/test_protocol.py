@@ -122,7 +122,7 @@ def test_the_answer_to_actions_is_the_error_under_others_over_the_error_under_th
 def test_movers_are_scored_by_the_pixels_and_voxels_they_cover(monkeypatch, config):
     grid = config_lib.VoxelGrid((8, 1, 1), 1.0, (-4.0, -0.5, 0.5))
     config = dataclasses.replace(config, model=dataclasses.replace(
-        config.model, latent="1d", heads=("image",), voxels=grid))
+        config.model, heads=("image",), voxels=grid))
     batch = _batch()
     pixels, voxels = np.zeros(batch.image.shape[:-1], bool), np.zeros(batch.occupancy.shape, bool)
     pixels[:, :, 0, 0] = voxels[:, :, 4:] = True  # the wall's voxels of the last step, the one of frame 4

@@ -18,7 +18,7 @@ GRID = config_lib.VoxelGrid((16, 16, 2), 1.0, (-8.0, -8.0, 0.5))
 def config_of(kinematics="bicycle"):
     config = presets.tiny()
     return dataclasses.replace(
-        config, model=dataclasses.replace(config.model, latent="1d", heads=("image", "range_view"), voxels=GRID,
+        config, model=dataclasses.replace(config.model, heads=("image", "range_view"), voxels=GRID,
                                           range_view=GEOMETRY),
         contract=config_lib.ActionContract(kinematics=kinematics),
         data=dataclasses.replace(config.data, context=CONTEXT, horizon=HORIZON, stride=2))

@@ -17,8 +17,10 @@ GRID = config_lib.VoxelGrid(shape=(32, 32, 8), voxel_size_m=1.0, origin_m=(-16.0
 VIEW = config_lib.RangeViewGeometry(rows=64, columns=256, elevation_min_rad=-0.5, elevation_max_rad=0.2,
                                     position_m=(0.0, 0.0, 2.0))
 FRAMES = 5
-CONFIG = dataclasses.replace(presets.tiny().model, first_guess="last_seen", follow_movers=True, memory_frames=FRAMES,
-                             heads=("range_view", "occupancy"), voxels=GRID, range_view=VIEW, occupancy_blocks=0)
+TINY = presets.tiny().model
+CONFIG = dataclasses.replace(TINY, heads=("range_view", "occupancy"), voxels=GRID, range_view=VIEW,
+                             latent=dataclasses.replace(TINY.latent, occupancy_blocks=0),
+                             first_guess=config_lib.LastSeen(memory_frames=FRAMES, follow_movers=True))
 look = jax.jit(glimpse.look, static_argnums=(0, 4))
 
 
@@ -101,5 +103,5 @@ def test_returns_off_their_beams_are_shown_where_they_were():
 
 def test_too_few_remembered_frames_to_tell_what_moves_are_refused():
     with pytest.raises(ValueError, match="memory_frames is 3; set it to 4 or more"):
-        dataclasses.replace(CONFIG, memory_frames=3)
+        config_lib.LastSeen(memory_frames=3, follow_movers=True)
     assert memory.guessed_heads(CONFIG) == ("range_view", "occupancy")

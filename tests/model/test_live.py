@@ -43,7 +43,7 @@ def test_a_stream_ends_where_the_window_ends():
 
 def test_a_stream_with_memory_may_start_from_zeros():
     """A sealed model's consumer knows shapes alone."""
-    model = world_model.WorldModel(dataclasses.replace(CONFIG, first_guess="last_seen", heads=("range_view",),
+    model = world_model.WorldModel(dataclasses.replace(CONFIG, first_guess=config_lib.LastSeen(), heads=("range_view",),
                                                        kinematics=config_lib.Kinematics()))
     variables, batch = jax.tree.map(jnp.asarray, model.init(jax.random.key(0))), make_batch(2)
     begun = live.start_live(model, jax.random.key(7))
@@ -63,7 +63,7 @@ def test_a_stream_with_memory_may_start_from_zeros():
 
 @pytest.mark.parametrize(("lidar", "camera"), [("pp", "wob"), ("rv", "bev")])
 def test_every_sensor_encoder_can_be_streamed(lidar, camera):
-    config = dataclasses.replace(CONFIG, lidar=lidar, camera=camera)
+    config = config_lib.override_all(presets.tiny(), {"model.lidar": lidar, "model.camera": camera}).model
     model = world_model.WorldModel(config)
     seen = {name: jax.ShapeDtypeStruct((1, *shape), BATCH_FIELDS[name][0])
             for name, shape in world_model.inputs(config).items()}

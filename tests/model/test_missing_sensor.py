@@ -1,6 +1,5 @@
 """A model that lacks camera or lidar fuses what is left; shapes alone are computed, nothing compiles."""
 
-import dataclasses
 
 import jax
 import numpy as np
@@ -18,8 +17,8 @@ HEADS = {"camera": ("range_view", "occupancy", "action"), "lidar": ("image", "ac
 
 def tiny(lacks, **model):
     config = presets.tiny()
-    changes = {lacks: "none", "heads": HEADS[lacks], **model}
-    return dataclasses.replace(config, model=dataclasses.replace(config.model, **changes))
+    changes = {lacks: config_lib.NO_SENSOR, "heads": HEADS[lacks], **model}
+    return config_lib.override_all(config, {f"model.{name}": value for name, value in changes.items()})
 
 
 @pytest.mark.parametrize("lacks", ["camera", "lidar"])
@@ -47,7 +46,7 @@ def test_every_fusion_embeds_one_sensor(fusion, latent, lacks):
     model = world_model.WorldModel(config.model)
     batch = preparation.expected_batch(config, 2)
     embedding, _ = jax.eval_shape(model.encode, model.variable_shapes(), batch)
-    channels = config.model.token_channels if latent == "2d" else config.model.embedding_channels
+    channels = config.model.fusion.token_channels if latent == "2d" else config.model.latent.embedding_channels
     assert embedding.shape[:2] == (2, config.data.frames) and embedding.shape[-1] == channels
 
 
@@ -59,4 +58,4 @@ def test_a_model_needs_a_sensor_and_its_batch():
                               image=np.zeros((1, 2, *model.config.image_size, 3), np.uint8))
     with pytest.raises(ValueError, match=r"Batch\.range_view is None"):
         model.init(jax.random.key(0), image_alone)
-    assert config_lib.NO_SENSOR not in config_lib.CAMERA_ENCODERS
+    assert config_lib.NO_SENSOR not in config_lib.CAMERAS

@@ -36,7 +36,8 @@ def variables():
 @pytest.fixture(scope="module")
 def state():
     draw = lambda seed, channels: jax.random.normal(jax.random.key(seed), (BATCH, channels))
-    return LatentState(jnp.tanh(draw(1, CONFIG.deterministic_channels)), draw(2, CONFIG.stochastic_channels))
+    sizes = CONFIG.latent
+    return LatentState(jnp.tanh(draw(1, sizes.deterministic_channels)), draw(2, sizes.stochastic_channels))
 
 
 @pytest.fixture(scope="module")
@@ -51,8 +52,9 @@ def assert_close(first, second, tolerance=1e-5):
 def test_observe_shapes_and_determinism(variables):
     batch, key = make_batch(), jax.random.key(5)
     observed = rollout.observe(MODEL, variables, key, batch)
-    assert observed.states.deterministic.shape == (BATCH, FRAMES, CONFIG.deterministic_channels)
-    assert observed.prior.mean.shape == observed.posterior.std.shape == (BATCH, FRAMES, CONFIG.stochastic_channels)
+    assert observed.states.deterministic.shape == (BATCH, FRAMES, CONFIG.latent.deterministic_channels)
+    moments = (BATCH, FRAMES, CONFIG.latent.stochastic_channels)
+    assert observed.prior.mean.shape == observed.posterior.std.shape == moments
     assert_close(observed, rollout.observe(MODEL, variables, key, batch), 0)
     other = rollout.observe(MODEL, variables, jax.random.key(6), batch)
     assert not np.allclose(observed.states.stochastic, other.states.stochastic)
@@ -87,7 +89,7 @@ def test_noise_is_standard_normal_and_its_coin_fair():
 
 def test_imagine_equals_a_loop_by_hand(variables, state, actions):
     dream = rollout.imagine(MODEL, variables, jax.random.key(0), state, actions, sampled=False)
-    assert dream.states.stochastic.shape == (BATCH, HORIZON, CONFIG.stochastic_channels)
+    assert dream.states.stochastic.shape == (BATCH, HORIZON, CONFIG.latent.stochastic_channels)
     np.testing.assert_array_equal(dream.actions, actions)
     current = state
     for step in range(HORIZON):
@@ -110,7 +112,7 @@ def test_imagine_is_imagine_step_again_and_again(variables, state, actions):
 def test_imagine_step_takes_any_leading_axes_and_compiles_once(variables, state, actions):
     step = lambda key, state, action: rollout.imagine_step(MODEL, variables, key, state, action)
     one = step(jax.random.key(1), state[0], actions[0, 0])
-    assert one.stochastic.shape == (CONFIG.stochastic_channels,)
+    assert one.stochastic.shape == (CONFIG.latent.stochastic_channels,)
     before = rollout._imagine_one._cache_size()
     for seed in (2, 3):
         other = step(jax.random.key(seed), state[0], actions[0, 1])
@@ -138,7 +140,7 @@ def test_branches_are_independent_futures(variables, state, actions):
     assert_close(dream[:, 0], dream[:, 2])
     assert_close(dream[:, 1], rollout.imagine(MODEL, variables, jax.random.key(1), state, -actions, sampled=False))
     sampled = rollout.imagine(MODEL, variables, jax.random.key(1), state, actions, branches=3)
-    assert sampled.states.stochastic.shape == (BATCH, 3, HORIZON, CONFIG.stochastic_channels)
+    assert sampled.states.stochastic.shape == (BATCH, 3, HORIZON, CONFIG.latent.stochastic_channels)
     assert not np.allclose(sampled.states.stochastic[:, 0], sampled.states.stochastic[:, 1])
 
 

@@ -14,10 +14,12 @@ from muvo_jax.model import rollout, token_transition, tokens, world_model
 from muvo_jax.types import LatentState
 
 pytestmark = pytest.mark.usefixtures("strict_dtypes")
-CONFIG = dataclasses.replace(presets.get("tiny").model, latent="2d")
+TINY = config_lib.override(presets.get("tiny"), "model.latent", "2d")
+CONFIG = TINY.model
 MODEL = world_model.WorldModel(CONFIG)
 BATCH, FRAMES, OBSERVED_TOKENS = 3, 3, 7
-SHAPE = (tokens.count(CONFIG), CONFIG.token_channels)
+CHANNELS = CONFIG.fusion.token_channels
+SHAPE = (tokens.count(CONFIG), CHANNELS)
 
 
 @pytest.fixture(scope="module")
@@ -27,7 +29,7 @@ def variables():
 
 @pytest.fixture(scope="module")
 def window():
-    return make_window(BATCH, FRAMES, (OBSERVED_TOKENS, CONFIG.token_channels), SHAPE, dropout=True)
+    return make_window(BATCH, FRAMES, (OBSERVED_TOKENS, CHANNELS), SHAPE, dropout=True)
 
 
 @pytest.fixture(scope="module")
@@ -44,7 +46,7 @@ def assert_close(first, second, tolerance=2e-5):
 
 
 def test_the_papers_sizes_give_1093_tokens():
-    paper = config_lib.ModelConfig(latent="2d")
+    paper = config_lib.ModelConfig(latent=config_lib.TokenLatent())
     assert tokens.groups(paper) == {"image": (10, 26), "range_view": (4, 64), "occupancy": (12, 12, 4), "action": ()}
     assert tokens.count(paper) == 1093
     assert MODEL.feature_shape == (19, 24) and MODEL.policy_feature_channels == 4 * 24
@@ -63,23 +65,23 @@ def test_heads_read_their_own_tokens_and_the_reference_s_alone():
 
 
 def test_the_cells_of_a_sensor_keep_their_places_and_the_rest_gets_the_mean():
-    alone = lambda count, **changed: np.asarray(tokens.of_observation(
-        jnp.arange(1.0, count * 12 + 1).reshape(1, count, 12), dataclasses.replace(CONFIG, **changed)))
+    alone = lambda count, setting, value: np.asarray(tokens.of_observation(
+        jnp.arange(1.0, count * 12 + 1).reshape(1, count, 12), config_lib.override(TINY, setting, value).model))
     mean = lambda count: np.broadcast_to(np.arange(1.0, count * 12 + 1).reshape(count, 12).mean(axis=0), (19, 12))
-    image = alone(7, lidar="pp")[0]  # 2 cells of the image, 3 of a lidar, route, speed
+    image = alone(7, "model.lidar", "pp")[0]  # 2 cells of the image, 3 of a lidar, route, speed
     np.testing.assert_array_equal(image[:2], np.arange(1.0, 25).reshape(2, 12))
     np.testing.assert_allclose(image[2:], mean(7)[2:], rtol=1e-6)
-    lidar = alone(13, camera="bev")[0]  # 3 cells of a bird's-eye view, 8 of the range view, route, speed
+    lidar = alone(13, "model.camera", "bev")[0]  # 3 cells of a bird's-eye view, 8 of the range view, route, speed
     np.testing.assert_array_equal(lidar[2:10], np.arange(1.0, 157).reshape(13, 12)[3:11])
     np.testing.assert_allclose(np.delete(lidar, slice(2, 10), 0), np.delete(mean(13), slice(2, 10), 0), rtol=1e-6)
-    np.testing.assert_allclose(alone(13, many_tokens=True)[0], mean(13), rtol=1e-6)
+    np.testing.assert_allclose(alone(13, "model.fusion.many_tokens", True)[0], mean(13), rtol=1e-6)
 
 
 def test_aligned_tokens_start_where_they_stand():
-    model = world_model.WorldModel(dataclasses.replace(CONFIG, aligned_tokens=True))
+    model = world_model.WorldModel(config_lib.override(TINY, "model.latent.aligned_tokens", True).model)
     variables = jax.tree.map(jnp.asarray, model.init(jax.random.key(0)))
     cells = tokens.count(CONFIG) - 8 - 1  # of image and range view, which the observation has too
-    window = make_window(BATCH, FRAMES, (cells + 2, CONFIG.token_channels), SHAPE)
+    window = make_window(BATCH, FRAMES, (cells + 2, CHANNELS), SHAPE)
     aligned = jax.jit(lambda variables: rollout.filter_embeddings(model, variables, *window))
     of_queries = jax.jit(lambda variables: rollout.filter_embeddings(MODEL, variables, *window))
     transition = variables["params"]["transition"]
@@ -195,7 +197,7 @@ def test_the_posterior_of_the_reference_does_not_mark_its_memory(variables, wind
     noise = noise.replace(dropout=None)
     moved = jax.tree.map(lambda leaf: leaf, variables)
     table = moved["params"]["transition"]["type_embedding"]
-    moved["params"]["transition"]["type_embedding"] = table.at[1].add(jnp.linspace(-1, 1, CONFIG.token_channels))
+    moved["params"]["transition"]["type_embedding"] = table.at[1].add(jnp.linspace(-1, 1, CHANNELS))
     start = MODEL.initial_state(BATCH)
     for numerics, expected in (("standard", [True, True]), ("reference", [True, False])):
         # The transition alone: the decoders of the other numerics have other shapes.

@@ -15,7 +15,7 @@ from muvo_jax.types import LatentState, StepNoise
 pytestmark = pytest.mark.usefixtures("strict_dtypes")
 CONFIG = presets.get("tiny").model
 MODEL = world_model.WorldModel(CONFIG)
-BATCH, FRAMES, CHANNELS = 3, 4, CONFIG.stochastic_channels
+BATCH, FRAMES, CHANNELS = 3, 4, CONFIG.latent.stochastic_channels
 
 
 @pytest.fixture(scope="module")
@@ -25,7 +25,7 @@ def variables():
 
 @pytest.fixture(scope="module")
 def window():
-    return make_window(BATCH, FRAMES, (CONFIG.embedding_channels,), (CHANNELS,))
+    return make_window(BATCH, FRAMES, (CONFIG.latent.embedding_channels,), (CHANNELS,))
 
 
 def test_gru_by_hand():
@@ -91,7 +91,7 @@ def test_prior_dropout_never_changes_a_first_step(variables, window):
 
 
 def test_the_action_enters_the_latents_and_not_the_recurrence(variables):
-    state = LatentState(jnp.full((1, CONFIG.deterministic_channels), 0.3), jnp.full((1, CHANNELS), 0.2))
+    state = LatentState(jnp.full((1, CONFIG.latent.deterministic_channels), 0.3), jnp.full((1, CHANNELS), 0.2))
     silence = jnp.zeros((1, CHANNELS))
     left, prior_left = MODEL.imagine_step(variables, silence, state, jnp.float32([[0.0, -1.0]]))
     right, prior_right = MODEL.imagine_step(variables, silence, state, jnp.float32([[0.0, 1.0]]))

@@ -64,7 +64,7 @@ def test_model_is_frozen_and_hashable():
 
 def test_embedding_of_a_sample_does_not_depend_on_the_others_in_evaluation(variables, batch):
     whole = encode(MODEL, variables, batch)
-    assert whole.shape == (BATCH, FRAMES, CONFIG.embedding_channels) and whole.dtype == jnp.float32
+    assert whole.shape == (BATCH, FRAMES, CONFIG.latent.embedding_channels) and whole.dtype == jnp.float32
     np.testing.assert_allclose(encode(MODEL, variables, batch[1:2]), whole[1:2], atol=1e-5)
 
 
@@ -104,7 +104,7 @@ def test_a_modality_that_is_switched_off_is_neither_read_nor_has_parameters(batc
     weights = model.init(jax.random.key(0))
     assert not {"route", "speed", "decoders_image", "decoders_occupancy"} & set(weights["params"])
     blind = batch.replace(route_map=None, speed_mps=None)
-    assert encode(model, weights, blind).shape == (BATCH, FRAMES, CONFIG.embedding_channels)
+    assert encode(model, weights, blind).shape == (BATCH, FRAMES, CONFIG.latent.embedding_channels)
 
 
 def test_inputs_that_do_not_fit_are_refused(variables, batch):

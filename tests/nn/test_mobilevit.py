@@ -49,8 +49,8 @@ def test_only_who_asks_for_timms_sizes_sees_the_growth(size, grown):
 def test_a_model_encodes_sides_that_are_odd_in_patches(numerics, many_tokens):
     tiny = presets.tiny().model
     config = dataclasses.replace(
-        tiny, backbone="mobilevitv2_100", image_size=(96, 160), numerics=numerics, many_tokens=many_tokens,
-        lidar="rv", camera="wob", fusion="tr", latent="1d",
+        tiny, backbone="mobilevitv2_100", image_size=(96, 160), numerics=numerics,
+        fusion=dataclasses.replace(tiny.fusion, many_tokens=many_tokens),
         range_view=dataclasses.replace(tiny.range_view, rows=32, columns=96))
     shapes = world_model.WorldModel(config).variable_shapes()
     assert "backbone" in shapes["params"]["camera"] and "backbone" in shapes["params"]["lidar"]

@@ -1,11 +1,11 @@
 """float32 means float32 in every product of a model, forwards and backwards, on accelerators too."""
 
-import dataclasses
 import re
 
 import jax
 import pytest
 
+from muvo_jax import config as config_lib
 from muvo_jax import presets
 from muvo_jax.model import world_model
 from muvo_jax.training import optimizer, preparation, state, step
@@ -13,8 +13,7 @@ from muvo_jax.training import optimizer, preparation, state, step
 
 @pytest.mark.parametrize("latent", ["1d", "2d"])
 def test_a_training_step_for_a_gpu_rounds_no_factor(latent):
-    config = presets.tiny()
-    config = dataclasses.replace(config, model=dataclasses.replace(config.model, latent=latent))
+    config = config_lib.override(presets.tiny(), "model.latent", latent)
     model, make = world_model.WorldModel(config.model), optimizer.make_optimizer(config.optimizer, 1)
     fresh = jax.eval_shape(lambda variables, key: state.create(variables, make, key), model.variable_shapes(),
                            jax.random.key(0))

@@ -1,23 +1,61 @@
-"""Does training teach a model to obey actions: worlds in which nothing else decides what comes next.
+"""Does training teach a model to obey actions, in worlds in which nothing else decides what comes next?
 
-Measured with actions that reach prior and posterior alone: gain 0.91 of the bar with either latent, 0.93 of the wall
-with the 1D latent, 0.75 with the 2D latent. (In the recurrence, with nothing known of the car's motion, the 2D latent
-has 0.82 of the wall after 150 steps.)
+Measured (gain / correlation): bar 0.93 / 0.97 (1d) and 0.95 / 0.98 (2d), with memory 0.99 / 0.98 (2d); wall 0.99 / 0.95
+(1d), with memory 1.10 / 0.99 (1d) and 1.12 / 0.93 (2d). The 2D latent without memory has 0.70 / 0.98 of the wall: it
+knows when the wall comes nearer, but its frames are too small an answer. Observed ones are off by 1.9 m where the 1D
+latent's are by 0.4 m: what it draws of a state falls short before any action. The 1D latent with memory has 0.75 / 0.81
+of the bar, and draws observed frames worse than imagined ones.
 """
 
+import functools
+
+import jax
+import numpy as np
 import probe_worlds
 import pytest
 
+from muvo_jax import config as config_lib
+from muvo_jax.model import camera, lidar
+
 WORLDS = {"bar": probe_worlds.Bar(), "wall": probe_worlds.Wall()}
-DEAF = pytest.mark.xfail(strict=True, reason="an action is one token among many")
+UNSTEADY = pytest.mark.xfail(strict=True, reason="observed frames are drawn far off, perhaps by the running statistics "
+                             "of a lidar that always sees the same")
+FAINT = pytest.mark.xfail(strict=True, reason="ranges are drawn too near their mean, of observed frames too")
+NOISE = 10.0  # standard deviation of the noise in the overfitted batch, grey values
+
+
+@pytest.fixture(autouse=True)
+def encoders_that_compile_in_no_time(monkeypatch):
+    monkeypatch.setitem(camera.REGISTRY, config_lib.PlaneCamera, probe_worlds.PatchCamera)
+    monkeypatch.setitem(lidar.REGISTRY, config_lib.RangeViewLidar, probe_worlds.PatchLidar)
+
+
+@functools.cache
+def trainer_of(world, latent, memory):
+    return probe_worlds.Trainer(WORLDS[world], probe_worlds.config_of(WORLDS[world], latent, memory))
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("world", "latent"), [
-    ("bar", "1d"), ("bar", "2d"), ("wall", "1d"), pytest.param("wall", "2d", marks=DEAF)])
-def test_what_is_imagined_obeys_the_action_and_beats_the_last_frame(world, latent):
-    trainer = probe_worlds.Trainer(WORLDS[world], probe_worlds.config_of(WORLDS[world], latent))
+@pytest.mark.parametrize(("world", "latent", "memory"), [
+    ("bar", "1d", False), ("bar", "2d", False), ("wall", "1d", False),
+    pytest.param("wall", "2d", False, marks=FAINT),
+    pytest.param("bar", "1d", True, marks=UNSTEADY), ("bar", "2d", True), ("wall", "1d", True), ("wall", "2d", True)])
+def test_what_is_imagined_obeys_the_action_and_beats_the_last_frame(world, latent, memory):
+    trainer = trainer_of(world, latent, memory)
     batches = [probe_worlds.windows(WORLDS[world], seed) for seed in range(probe_worlds.BATCHES)]
-    found = probe_worlds.judge(trainer, trainer.train(lambda step: batches[step % len(batches)]))
+    found = probe_worlds.judge(trainer, trainer.train(batches))
     assert found["gain"] > 0.9 and found["correlation"] > 0.9, found
     assert found["imagined"] < found["copied"], found
+
+
+@pytest.mark.slow
+def test_one_batch_is_learned_to_near_its_noise():
+    trainer = trainer_of("bar", "2d", False)
+    batch = probe_worlds.windows(WORLDS["bar"], 0, 4)
+    image = batch.image + np.random.default_rng(0).normal(0.0, NOISE, batch.image.shape)
+    batch = batch.replace(image=np.clip(image, 0, 255).astype(np.uint8))
+    batch = jax.tree.map(lambda leaf: np.concatenate([leaf] * (probe_worlds.WINDOWS // 4)), batch)
+    variables = trainer.train([batch])
+    imagined = trainer.imagine(variables, batch, batch.action[:, None, probe_worlds.SEEN - 1:-1])[:, 0]
+    error = np.sqrt(np.square(255.0 * imagined - batch.image[:, probe_worlds.SEEN:]).mean())
+    assert error < 1.3 * NOISE, error

@@ -28,7 +28,7 @@ class SmallNetwork(linen.Module):
         self.convolution = layers.Conv(4, (3, 3), layers.Compute(convolution="xla"), stride=2)
         self.range_convolution = layers.Conv(4, (3, 3), layers.Compute(convolution="xla"), stride=2)
         self.norm, self.range_norm = norm.BatchNorm(), norm.BatchNorm()
-        self.embed = layers.Dense(self.config.embedding_channels)
+        self.embed = layers.Dense(self.config.latent.embedding_channels)
         self.heads = {name: {scale: layers.Dense(int(np.prod(shape))) for scale, shape in shapes.items()}
                       for name, shapes in head_shapes(self.config).items()}
 
@@ -37,7 +37,7 @@ class SmallNetwork(linen.Module):
         range_view = jax.nn.relu(self.range_norm(self.range_convolution(range_view / 50), mode))
         pooled = [jnp.concatenate([value.mean(axis=(1, 2)), jnp.square(value).mean(axis=(1, 2))], axis=-1)
                   for value in (image, range_view)]
-        return self.embed(attention.dropout(jnp.concatenate(pooled, axis=-1), keys, 0, self.config.dropout))
+        return self.embed(attention.dropout(jnp.concatenate(pooled, axis=-1), keys, 0, self.config.fusion.dropout))
 
     def observe_step(self, *args):
         return self.transition.observe_step(*args)
@@ -117,7 +117,8 @@ def make_config(accumulate=1, **model):
     config = presets.tiny()
     return dataclasses.replace(
         config,
-        model=dataclasses.replace(config.model, dropout=0.2, prior_dropout=0.5, **model),
+        model=dataclasses.replace(config.model, fusion=dataclasses.replace(config.model.fusion, dropout=0.2),
+                                  prior_dropout=0.5, **model),
         data=dataclasses.replace(config.data, frames=3),
         augmentation=dataclasses.replace(config.augmentation, image=True),
         train=dataclasses.replace(config.train, batch=WINDOWS // accumulate, observe_frames=2, decode_frames=2),

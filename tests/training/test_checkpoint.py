@@ -36,7 +36,8 @@ def fresh(config):
 def _fresh(config):
     variables = {"params": {"layer": {"kernel": jnp.arange(8.0 * 4096).reshape(8, 4096), "bias": jnp.ones(3)}},
                  "batch_stats": {"norm": {"mean": jnp.zeros(3)}}}
-    return state.create(variables, optimizer.make_optimizer(config.optimizer, 10), jax.random.key(7))
+    return state.create(variables, optimizer.make_optimizer(config.optimizer, 10), jax.random.key(7),
+                        config.train.trainable)
 
 
 def _at(fresh, step):
@@ -131,9 +132,27 @@ def test_only_damaged_checkpoints_is_an_error(tmp_path, fresh, config):
 
 def test_another_architecture_is_refused_by_naming_both(tmp_path, fresh, config):
     _save(tmp_path, fresh, config, 1).close()
-    other = dataclasses.replace(config, preset="other", model=dataclasses.replace(config.model, embedding_channels=24))
+    other = config_lib.override(dataclasses.replace(config, preset="other"), "model.latent.embedding_channels", 24)
     with pytest.raises(ValueError, match=r"preset 'tiny'.*preset 'other'.*embedding_channels 16 \(stored\) against 24"):
         checkpoint.Checkpoints(tmp_path).restore_latest(fresh, other)
+
+
+def test_a_checkpoint_with_the_config_of_version_1_is_read(tmp_path, fresh, config, monkeypatch):
+    kept = json.loads((pathlib.Path(__file__).parents[1] / "kept_runs/tiny-tr.json").read_text())
+    with monkeypatch.context() as patch:
+        patch.setattr(config_lib.Config, "to_dict", lambda self: kept)
+        _save(tmp_path, fresh, config, 1).close()
+    assert checkpoint.load_run(tmp_path).config == presets.tiny()
+    assert checkpoint.Checkpoints(tmp_path).restore_latest(fresh, config).step == 1
+
+
+def test_a_run_with_frozen_parameters_goes_on_and_refuses_to_train_others(tmp_path, config):
+    some = config_lib.override(config, "train.trainable", "!layer/kernel")
+    fresh = _fresh(some)
+    keeper = _save(tmp_path, fresh, some, 1)
+    _assert_same(keeper.restore_latest(fresh, some).state, _at(fresh, 1))
+    with pytest.raises(ValueError, match=r"trained with train\.trainable=!layer/kernel, .* go on with \*: .*--init"):
+        keeper.restore_latest(_fresh(config), config)
 
 
 def test_keeps_the_last_and_the_best(tmp_path, fresh, config):

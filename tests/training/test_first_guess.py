@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import small_world
 
+from muvo_jax import config as config_lib
 from muvo_jax import presets
 from muvo_jax.metrics import baselines
 from muvo_jax.model import world_model
@@ -15,7 +16,7 @@ from muvo_jax.training import first_guess
 
 @pytest.fixture(scope="module")
 def setting():
-    config = dataclasses.replace(presets.tiny().model, first_guess="training_mean", range_view_points="beams")
+    config = dataclasses.replace(presets.tiny().model, first_guess=config_lib.TrainingMean(), range_view_points="beams")
     batch = small_world.make_batch(config)
     return config, baselines.TrainingMean().add(batch)
 

@@ -105,7 +105,8 @@ def _config(**train):
                 "preview_every": 0, "validation_windows": 2, "parallel": "auto", **train}
     return dataclasses.replace(
         config, data=dataclasses.replace(config.data, path="memory", frames=3, stride=1, context=2, horizon=2),
-        model=dataclasses.replace(config.model, heads=("image", "action"), dropout=0.2, prior_dropout=0.5),
+        model=dataclasses.replace(config.model, heads=("image", "action"), prior_dropout=0.5,
+                                  fusion=dataclasses.replace(config.model.fusion, dropout=0.2)),
         train=dataclasses.replace(config.train, **settings))
 
 
@@ -222,9 +223,14 @@ def test_a_finished_run_has_nothing_left_to_train(uninterrupted):
 
 def test_resuming_with_another_architecture_names_both(uninterrupted):
     config = dataclasses.replace(_config(), preset="wider")
-    config = config_lib.override(config, "model.deterministic_channels", 24)
+    config = config_lib.override(config, "model.latent.deterministic_channels", 24)
     with pytest.raises(ValueError, match=r"another architecture.*deterministic_channels 16 \(stored\) against 24"):
         _train(uninterrupted[0], config=config, resume=True)
+
+
+def test_resuming_with_other_parameters_to_train_names_both_and_what_to_do(uninterrupted):
+    with pytest.raises(ValueError, match=r"trained with train\.trainable=\*, and cannot go on with !embed.*--init"):
+        _train(uninterrupted[0], config=_config(trainable="!embed"), resume=True)
 
 
 def test_a_new_run_starts_from_the_weights_of_another(tmp_path, uninterrupted):
@@ -239,8 +245,7 @@ def test_a_new_run_starts_from_the_weights_of_another(tmp_path, uninterrupted):
 
 
 def test_weights_of_another_network_are_refused_naming_both(tmp_path, uninterrupted):
-    config = _config()
-    wider = dataclasses.replace(config, model=dataclasses.replace(config.model, deterministic_channels=32))
+    wider = config_lib.override(_config(), "model.latent.deterministic_channels", 32)
     with pytest.raises(ValueError, match=r"deterministic_channels 16 \(stored\) against 32 \(asked for\)"):
         _train(tmp_path / "other", config=wider, init=uninterrupted[0])
     assert not (tmp_path / "other").exists()

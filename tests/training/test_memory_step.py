@@ -43,8 +43,9 @@ def test_cuts_of_a_recording_stay():
 def config_of():
     tiny = presets.tiny()
     small = dataclasses.replace(
-        tiny.model, first_guess="last_seen", action_path="recurrence", memory_frames=2, guided_channels=(8, 8, 8),
-        camera="none", heads=("range_view", "occupancy"), route=False, range_view=VIEW, range_view_points="beams")
+        tiny.model, first_guess=config_lib.LastSeen(memory_frames=2, guided_channels=(8, 8, 8)),
+        action_path="recurrence", camera=None, heads=("range_view", "occupancy"), route=False, range_view=VIEW,
+        range_view_points="beams")
     return dataclasses.replace(
         tiny, model=small, data=dataclasses.replace(tiny.data, frames=FRAMES),
         train=dataclasses.replace(tiny.train, batch=WINDOWS, observe_frames=SEEN, decode_frames=2, restart=True))

@@ -7,6 +7,7 @@ import golden_rule
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optax
 import pytest
 
 from muvo_jax import config as config_lib
@@ -60,31 +61,44 @@ def test_updates_match_torch_with_cycled_momentum_and_two_groups():
     gradients = [{name: generator.normal(size=value.shape) for name, value in params.items()} for _ in range(6)]
     optimizer = optimizer_lib.make_optimizer(CONFIG, 10)
     ours = jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float32), params)
-    packed = optimizer_lib.pack(ours)
-    state = optimizer.init(packed)
+    state = optimizer.init(ours)
     for gradient in gradients:
-        gradient = optimizer_lib.pack(jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float32), gradient))
-        updates, state = optimizer.update(gradient, state, packed)
-        packed = jax.tree.map(jnp.add, packed, updates)
-    ours = optimizer_lib.unpack(packed, ours)
+        gradient = jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float32), gradient)
+        updates, state = optimizer.update(gradient, state, ours)
+        ours = optax.apply_updates(ours, updates)
     for name, decay in (("kernel", 0.01), ("bias", 0.0), ("scalar", 0.01)):
         expected = torch_adamw(params[name], [gradient[name] for gradient in gradients], decay, 10)
         moved = np.abs(expected - params[name]).max()
         assert np.abs(ours[name] - expected).max() < 1e-3 * moved
 
 
-def test_packing_groups_by_axes_and_loses_nothing():
-    tree = {"kernel": jnp.arange(4.0).reshape(2, 2), "bias": jnp.arange(4.0, 6.0), "scalar": jnp.float32(6.0),
-            "more": {"scale": jnp.arange(7.0, 10.0)}}
-    packed = optimizer_lib.pack(tree)
-    assert sorted(packed["decayed"].tolist()) == [0.0, 1.0, 2.0, 3.0, 6.0]
-    assert sorted(packed["undecayed"].tolist()) == [4.0, 5.0, 7.0, 8.0, 9.0]
-    chex.assert_trees_all_equal(optimizer_lib.unpack(packed, tree), tree)
+def test_a_transformation_of_two_vectors_is_one_of_trees():
+    """Against optax on the leaves themselves; a frozen leaf (None) is none."""
+    generator = np.random.default_rng(0)
+    tree = {"kernel": (2, 3), "bias": (4,), "scalar": (), "more": {"scale": (3,)}, "frozen": None}
+    draw = lambda: jax.tree.map(lambda shape: jnp.asarray(generator.normal(size=shape), jnp.float32), tree,
+                                is_leaf=lambda node: isinstance(node, tuple))
+    plain = optax.adamw(0.1, weight_decay=0.5, mask=lambda params: jax.tree.map(lambda leaf: leaf.ndim != 1, params))
+    packed = optimizer_lib.packed(optax.adamw(0.1, weight_decay=0.5, mask=optimizer_lib.decays))
+    params = draw()
+    states = [plain.init(params), packed.init(params)]
+    for _ in range(3):
+        gradients, updates = draw(), []
+        for index, transformation in enumerate((plain, packed)):
+            update, states[index] = transformation.update(gradients, states[index], params)
+            updates.append(update)
+        chex.assert_trees_all_close(updates[1], updates[0], rtol=1e-6)
+        np.testing.assert_allclose(optimizer_lib.norm(gradients), optax.global_norm(gradients), rtol=1e-6)
+        params = optax.apply_updates(params, updates[1])
+    assert params["frozen"] is None
+    vectors = [leaf.shape for leaf in jax.tree.leaves(states[1]) if leaf.ndim]
+    assert sorted(vectors) == [(7,), (7,), (7,), (7,)]  # kernel and scalar, bias and scale: two moments each
+    assert set(states[1][0].mu) == {"decayed", "undecayed"}  # names in the checkpoints of all runs so far
 
 
 def test_clipping_limits_the_global_norm():
     # Adam's first update does not depend on the gradient's scale, but the second moment keeps it.
-    gradient = optimizer_lib.pack({"w": jnp.array([[3.0, 4.0]])})
+    gradient = {"w": jnp.array([[3.0, 4.0]])}
     for clip_norm, expected in ((0.0, 25.0), (1.0, 1.0)):
         optimizer = optimizer_lib.make_optimizer(dataclasses.replace(CONFIG, clip_norm=clip_norm), 10)
         _, state = optimizer.update(gradient, optimizer.init(gradient), gradient)

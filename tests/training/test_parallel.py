@@ -212,7 +212,7 @@ def test_imagined_frames_follow_from_the_last_observed_one():
     # By hand: action[1] leads from the last observed frame, 1, to frame 2; h does not depend on the noise.
     noise = jnp.zeros_like(observed.last.stochastic)
     expected, _ = model.imagine_step(state.variables, noise, observed.last, batch.action[:, 1])
-    deterministic = config.model.deterministic_channels
+    deterministic = config.model.latent.deterministic_channels
     np.testing.assert_array_equal(features[:, :2], observed.states.features)
     np.testing.assert_allclose(features[:, 2, :deterministic], expected.deterministic, rtol=1e-5, atol=1e-6)
 

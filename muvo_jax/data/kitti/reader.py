@@ -25,11 +25,11 @@ import warnings
 import numpy as np
 
 from muvo_jax import config as config_lib
-from muvo_jax.data import files, schema, sequences
+from muvo_jax.data import ego_motion, files, schema, sequences
 from muvo_jax.data.kitti.files import LIDAR_HEIGHT_M, read_camera, read_oxts, read_pose, read_scan, text_lines
 
-__all__ = ["CAMERAS", "CONTRACT", "LIDAR", "LIDAR_HEIGHT_M", "KittiRecording", "derive_action", "find_drives",
-           "read_camera", "read_oxts", "read_pose", "read_scan"]
+__all__ = ["CAMERAS", "CONTRACT", "LIDAR", "LIDAR_HEIGHT_M", "KittiRecording", "find_drives", "read_camera",
+           "read_oxts", "read_pose", "read_scan"]
 
 # HDL-64E: 64 beams over 26.8 degrees, nominally -24.8 to +2.0. The calibrated scans reach from about -24 to +2.8, so
 # the field of view is taken a little wider, lest the highest beams fall into one row.
@@ -68,15 +68,6 @@ def find_drives(path: pathlib.Path) -> list[pathlib.Path]:
         return [path]
     return sorted(found for pattern in ("*_sync", "*/*_sync") for found in path.glob(pattern)
                   if found.is_dir() and _DRIVE.fullmatch(found.name))
-
-
-def derive_action(speed_mps: float, acceleration_mps2: float, yaw_rate_radps: float,
-                  contract: config_lib.ActionContract) -> np.ndarray:
-    """The action (float32 [2]) that a bicycle model would need to move like this; yaw rate > 0 turns left."""
-    full_mps2 = contract.accel_full_mps2 if acceleration_mps2 >= 0 else contract.brake_full_mps2
-    steering_rad = -math.atan(contract.wheelbase_m * yaw_rate_radps / max(speed_mps, 1.0))
-    return np.clip(np.array([acceleration_mps2 / full_mps2, steering_rad / contract.steer_full_rad]),
-                   -1.0, 1.0).astype(np.float32)
 
 
 class KittiRecording:
@@ -139,7 +130,8 @@ class KittiRecording:
             "speed_mps": np.float32(speed_mps),
             "yaw_rate_radps": np.float32(yaw_rate_radps),
             "pose": read_pose(paths["oxts"], first),
-            "action": derive_action(speed_mps, acceleration_mps2, yaw_rate_radps, self.description.contract),
+            "action": ego_motion.derive_action(speed_mps, acceleration_mps2, yaw_rate_radps,
+                                               self.description.contract),
             "timestamp_s": np.float64(drive.timestamps_s[position]),
             "frame_id": np.int64(frame_id),
         }
@@ -161,7 +153,7 @@ class KittiRecording:
         drive = self._drives[sequence.name]
         frame_id = int(drive.frame_ids[sequence.start + index])
         motion = read_oxts(drive.path("oxts", frame_id))
-        return derive_action(*motion, self.description.contract)
+        return ego_motion.derive_action(*motion, self.description.contract)
 
 
 def _files(folder: pathlib.Path, sensor: str) -> dict[int, str]:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import itertools
 import math
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -32,6 +32,20 @@ class StandIn:
         raise Refused(f"gives a state to {type(self).__name__}.")
 
 
+class Repeats(StandIn):
+    """Items of a list that were read together (pickle_repeats.py): arrays [items, ...], or a list."""
+
+    def __init__(self, values: np.ndarray | list):
+        self.values = values
+
+    def __len__(self) -> int:
+        return len(self.values)
+
+    def singles(self) -> list:
+        """The items one by one, as they would be on the stack."""
+        return [Array.of(row) for row in self.values] if isinstance(self.values, np.ndarray) else self.values
+
+
 class _DType(StandIn):
     def __init__(self, code: Any, *_):
         if not isinstance(code, str) or not _DTYPE.fullmatch(code):
@@ -49,7 +63,7 @@ class _DType(StandIn):
         return np.dtype(self.code if self.order == "|" or self.code == "?" else self.order + self.code)
 
 
-class _Array(StandIn):
+class Array(StandIn):
     """Of numbers: `values` is an ndarray. Of objects: a list in the order of `is_fortran`."""
 
     def __init__(self, *_):
@@ -57,12 +71,18 @@ class _Array(StandIn):
         self.shape: tuple[int, ...] = (0,)
         self.is_fortran = False
 
+    @classmethod
+    def of(cls, values: np.ndarray) -> Array:
+        array = cls()
+        array.values, array.shape = values, values.shape
+        return array
+
     def setstate(self, state: Any) -> None:
         _version, self.shape, dtype, is_fortran, data = state
         self.is_fortran = bool(is_fortran)
         if dtype.code[0] != "O":
             self.values = filled(data, dtype.dtype, self.shape, self.is_fortran, "array")
-        elif isinstance(data, list) and len(data) == _size(self.shape):
+        elif isinstance(data, list) and _count(data) == _size(self.shape):
             self.values = data
         else:
             raise Refused(f"holds {kind(data)} for an array of objects of another size.")
@@ -70,28 +90,30 @@ class _Array(StandIn):
     @property
     def size(self) -> int:
         """Bytes of the file that it must have taken, at least."""
-        return len(self.values) if isinstance(self.values, list) else self.values.size
+        return _count(self.values) if isinstance(self.values, list) else self.values.size
 
     def listed(self) -> list:
-        return list(self.values)
+        return list(_items(self.values))
 
     def row(self, index: int) -> np.ndarray | list:
         """Row `index` of an array with two axes."""
         if isinstance(self.values, np.ndarray):
             return self.values[index]
         rows, columns = self.shape
-        return self.values[index::rows] if self.is_fortran else self.values[index * columns:(index + 1) * columns]
+        if self.is_fortran:
+            return self.listed()[index::rows]
+        return _part(self.values, index * columns, (index + 1) * columns)
 
 
 class _Strings(StandIn):
     """pandas.arrays.StringArray (its state holds an array of objects) or ArrowStringArray (one of pyarrow's)."""
 
     def __init__(self, *_):
-        self.array = _Array()
+        self.array = Array()
 
     def setstate(self, state: Any) -> None:
         parts = state.values() if isinstance(state, dict) else state
-        (self.array,) = (part for part in parts if isinstance(part, _Array))
+        (self.array,) = (part for part in parts if isinstance(part, Array))
 
 
 class _Buffer(StandIn):
@@ -110,7 +132,7 @@ class _ArrowType(StandIn):
         self.offset = np.dtype("<i4" if name == "string" else "<i8")
 
 
-class _Text(_Array):
+class _Text(Array):
     """Strings of pyarrow, decoded only once the frame has been found not to be larger than its file.
 
     An array is (type, length, nulls, first, [validity bits, ends of the strings, their bytes], ...); several make one
@@ -162,7 +184,7 @@ class _Index(StandIn):
         data = values.get("data") if isinstance(values, dict) else None
         if isinstance(data, _Strings):
             data = data.array
-        self.labels = data if isinstance(data, _Array) else _Array()
+        self.labels = data if isinstance(data, Array) else Array()
 
 
 class _Block(StandIn):
@@ -184,7 +206,7 @@ class _Block(StandIn):
             numbers = placement.values
         if isinstance(self.values, _Strings) and len(numbers) == 1:
             return [(int(numbers[0]), self.values.array.listed())]
-        if not isinstance(self.values, _Array) or len(self.values.shape) != 2 or self.values.shape[0] != len(numbers):
+        if not isinstance(self.values, Array) or len(self.values.shape) != 2 or self.values.shape[0] != len(numbers):
             raise Refused(f"holds a block of {kind(self.values)}, which is not supported.")
         return [(int(number), self.values.row(row)) for row, number in enumerate(numbers)]
 
@@ -215,7 +237,7 @@ class Frame(StandIn):
                 raise Refused(f"{where}: more cells than the file has bytes. {HOW_TO_GO_ON}")
             names = labels.listed()
             by_number = dict(row for block in self.manager.blocks for row in block.rows())
-            table = {str(name): plain(by_number[number], where) for number, name in enumerate(names)}
+            table = {str(name): _cells(by_number[number], where) for number, name in enumerate(names)}
         except (AttributeError, TypeError, ValueError, KeyError, IndexError) as error:
             raise Refused(f"{where}: not a whole data frame ({type(error).__name__}: {error}). "
                           f"{HOW_TO_GO_ON}") from error
@@ -224,8 +246,8 @@ class Frame(StandIn):
         return table
 
 
-def _from_buffer(buffer: Any, dtype: Any, shape: Any, order: Any, axis_order: Any = None, *_) -> _Array:
-    array = _Array()
+def _from_buffer(buffer: Any, dtype: Any, shape: Any, order: Any, axis_order: Any = None, *_) -> Array:
+    array = Array()
     if not isinstance(dtype, _DType) or dtype.code[0] == "O" or order not in ("C", "F", "K"):
         raise Refused(f"holds an array with {kind(dtype)} for its dtype.")
     values = filled(buffer, dtype.dtype, shape, order == "F", "array")
@@ -248,7 +270,7 @@ def _slice(*bounds: Any) -> slice:
 
 def _names() -> dict[tuple[str, str], Callable]:
     known: dict[tuple[str, str], Callable] = {
-        ("numpy", "dtype"): _DType, ("numpy", "ndarray"): _Array,
+        ("numpy", "dtype"): _DType, ("numpy", "ndarray"): Array,
         ("builtins", "slice"): _slice,
         ("pandas._libs.internals", "_unpickle_block"): _Block,
         ("pandas._libs.arrays", "__pyx_unpickle_NDArrayBacked"): _Strings,
@@ -257,7 +279,7 @@ def _names() -> dict[tuple[str, str], Callable]:
         ("pandas.core.indexes.numeric", "Int64Index"): _Ignored,
     }
     for core in ("numpy.core", "numpy._core"):
-        known |= {(f"{core}.multiarray", "_reconstruct"): _Array, (f"{core}.multiarray", "scalar"): _scalar,
+        known |= {(f"{core}.multiarray", "_reconstruct"): Array, (f"{core}.multiarray", "scalar"): _scalar,
                   (f"{core}.numeric", "_frombuffer"): _from_buffer}
     known |= {("pyarrow.lib", "_restore_array"): _Text, ("pyarrow.lib", "chunked_array"): _Text.chunked,
               ("pyarrow.lib", "type_for_alias"): _ArrowType, ("pyarrow.lib", "py_buffer"): _Buffer}
@@ -279,6 +301,50 @@ def _size(shape: Any) -> int:
     return math.prod(shape)
 
 
+def _count(values: list) -> int:
+    return sum(len(value) if isinstance(value, Repeats) else 1 for value in values)
+
+
+def _items(values: Iterable) -> Iterator:
+    """Of a list, those that were read together one by one."""
+    return itertools.chain.from_iterable(value.values if isinstance(value, Repeats) else (value,) for value in values)
+
+
+def _shorter(values: list) -> Iterator:
+    """Of a list, all but the arrays that were read together one by one."""
+    for value in values:
+        if isinstance(value, Repeats) and isinstance(value.values, list):
+            yield from value.values
+        else:
+            yield value
+
+
+def _part(values: list, start: int, stop: int) -> list:
+    """Items `start` to `stop` of a list."""
+    part, first = [], 0
+    for value in values:
+        length = len(value) if isinstance(value, Repeats) else 1
+        begin, end = max(start - first, 0), min(stop - first, length)
+        if begin < end:
+            part.append(Repeats(value.values[begin:end]) if isinstance(value, Repeats) else value)
+        first += length
+    return part
+
+
+def _cells(values: Any, where: str) -> Any:
+    """A column: an array, of rows where each cell is an array of one size and type, else a list."""
+    if not isinstance(values, list):
+        return plain(values, where)
+    whole = list(_shorter(values))
+    parts = [value.values if isinstance(value, Repeats) else value.values[None] for value in whole
+             if isinstance(value, (Repeats, Array)) and isinstance(value.values, np.ndarray)]
+    if parts and len(parts) == len(whole) and parts[0].ndim > 1 and (
+            len({(part.shape[1:], part.dtype) for part in parts}) == 1):
+        return np.concatenate(parts)
+    items = list(_items(values))
+    return items if set(map(type, items)) == {str} else plain(items, where)  # strings hold nothing to be looked at
+
+
 def filled(content: Any, dtype: np.dtype, shape: Any, is_fortran: bool, where: str) -> np.ndarray:
     """An array from its bytes, after checking that there are as many as shape and dtype say."""
     size = _size(shape)
@@ -295,7 +361,7 @@ def filled(content: Any, dtype: np.dtype, shape: Any, is_fortran: bool, where: s
 def plain(value: Any, where: str, done: dict[int, Any] | None = None, depth: int = 0) -> Any:
     """Stand-ins inside lists and dicts become arrays (of objects: lists); what occurs twice is made once."""
     done = {} if done is None else done
-    if isinstance(value, _Array):
+    if isinstance(value, Array):
         value = value.values
     if isinstance(value, np.ndarray):
         return value
@@ -304,7 +370,7 @@ def plain(value: Any, where: str, done: dict[int, Any] | None = None, depth: int
     if depth > _DEPTH:
         raise Refused(f"{where}: nested too deeply. {HOW_TO_GO_ON}")
     if isinstance(value, (list, tuple)):
-        done[id(value)] = made = [plain(item, where, done, depth + 1) for item in value]
+        done[id(value)] = made = [plain(item, where, done, depth + 1) for item in _items(value)]
         return made
     if isinstance(value, dict):
         return {key: plain(item, where, done, depth + 1) for key, item in value.items()}

@@ -246,7 +246,7 @@ def occupancy_name(row: int) -> str:
 
 
 def _with_occupancy(run: muvo_runs.Run) -> muvo_runs.Run:
-    names = [occupancy_name(row) for row in range(run.frames)]
+    names = muvo_runs.NumberedNames(f"{OCCUPANCY_FOLDER}/{OCCUPANCY_FOLDER}_", np.arange(run.frames), 9, ".npz")
     return dataclasses.replace(run, columns=run.columns | {f"{OCCUPANCY_FOLDER}_path": names})
 
 

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import os
 import pathlib
 import re
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 
@@ -17,8 +18,50 @@ from muvo_jax.data.muvo import safe_pickle
 FRAME_FILE = "pd_dataframe.pkl"
 VERSION_FOLDER = "trainval"
 _NUMBER = re.compile(r"(\d{1,18})$")
+_NUMBERED = re.compile(r"(.*?)(\d{1,18})((?:\.[a-zA-Z]+)?)", re.DOTALL)
 _PICTURES = (".png", ".jpg", ".jpeg")
 _MODES = ("train", "val0", "val1", "val2")
+# Columns that are kept beside the paths of files; a table has three times as many, most of it the expert's features.
+_KEPT = ("action", "speed", "reward", "imu", "value", "n_classes")
+
+
+class NumberedNames(Sequence[str]):
+    """Names that differ in a number only, such as a path for each frame: a tenth of what the texts take."""
+
+    def __init__(self, prefix: str, numbers: np.ndarray, digits: int, suffix: str):
+        """Args:
+          numbers: int64 [N], written with that many digits or more between prefix and suffix.
+        """
+        self.numbers = numbers
+        self._prefix, self._digits, self._suffix = prefix, digits, suffix
+
+    @classmethod
+    def of(cls, names: Sequence[str]) -> NumberedNames | None:
+        """The same names; None where they are of another form."""
+        first = names[0] if len(names) and isinstance(names[0], str) else ""
+        match = _NUMBERED.fullmatch(first)
+        if match is None:
+            return None
+        prefix, digits, suffix = match.groups()
+        if not all(isinstance(name, str) and len(name) == len(first) and name.startswith(prefix)
+                   and name.endswith(suffix) for name in names):
+            return None
+        middles = [name[len(prefix):len(first) - len(suffix)] for name in names]
+        if not all(middle.isascii() and middle.isdigit() for middle in middles):
+            return None
+        return cls(prefix, np.array(middles, np.int64), len(digits), suffix)
+
+    def __len__(self) -> int:
+        return len(self.numbers)
+
+    def __getitem__(self, row):
+        if isinstance(row, slice):
+            return NumberedNames(self._prefix, self.numbers[row], self._digits, self._suffix)
+        return f"{self._prefix}{self.numbers[row]:0{self._digits}d}{self._suffix}"
+
+    def __iter__(self) -> Iterator[str]:
+        head, digits, tail = self._prefix, self._digits, self._suffix
+        return (f"{head}{number:0{digits}d}{tail}" for number in self.numbers.tolist())
 
 
 @dataclasses.dataclass(frozen=True)
@@ -28,7 +71,7 @@ class Run:
     Attributes:
       split, name: such as "train" and "train/Town01/0000".
       folder: where it is.
-      columns: of the data frame, by name.
+      columns: those of the data frame that frames are read from, by name: an array [F, ...], or a sequence of F cells.
       frames: number of rows.
     """
 
@@ -57,7 +100,10 @@ class Run:
             raise schema.DataError(f"{path}: column {column!r} is missing; there are {', '.join(self.columns)}.")
         cells = self.columns[column]
         try:
-            values = np.array([np.reshape(cell, size) for cell in cells], np.float32).reshape(len(cells), size)
+            if isinstance(cells, np.ndarray):  # cells of one size
+                values = cells.astype(np.float32).reshape(len(cells), size)
+            else:
+                values = np.array([np.reshape(cell, size) for cell in cells], np.float32).reshape(len(cells), size)
         except (TypeError, ValueError) as error:
             raise schema.DataError(f"{path}: column {column!r} does not hold {size} numbers a frame.") from error
         if not np.isfinite(values).all():
@@ -72,12 +118,16 @@ class Run:
           DataError: where the row names no file below the run's folder.
         """
         relative = self.columns[f"{kind}_path"][row]
-        # Tables that were written on Windows have its separators.
-        parts = pathlib.PurePosixPath(relative.replace("\\", "/")).parts if isinstance(relative, str) else ()
+        parts = pathlib.PurePosixPath(_with_slashes(relative)).parts if isinstance(relative, str) else ()
         if not parts or ".." in parts or parts[0] == "/" or "\0" in relative:
             raise schema.DataError(f"{self.folder / FRAME_FILE}, row {row}: {kind}_path is {str(relative)[:80]!r}, "
                                    f"expected a path inside the run's folder.")
         return self.folder.joinpath(*parts)
+
+
+def _with_slashes(relative: str) -> str:
+    """Tables that were written on Windows have its separators."""
+    return relative.replace("\\", "/") if "\\" in relative else relative
 
 
 @dataclasses.dataclass(frozen=True)
@@ -103,31 +153,45 @@ def find_files(run: Run, kind: str) -> KindFiles:
     unusual: dict[int, pathlib.Path] = {}
     if f"{kind}_path" not in run.columns:
         return KindFiles(present, unusual)
-    paths = [run.path(kind, row) for row in range(run.frames)]
-    listed = {folder: _by_stem(folder) for folder in {path.parent for path in paths}}
-    for row, path in enumerate(paths):
-        names = listed[path.parent].get(path.stem, {})
-        suffixes = (path.suffix, *_PICTURES) if path.suffix.lower() in _PICTURES and kind == "image" else (path.suffix,)
-        found = next((names[suffix.lower()] for suffix in suffixes if suffix.lower() in names), None)
-        present[row] = found is not None
-        if found is not None and found != path.name:
-            unusual[row] = path.with_name(found)
-    if paths and not present.any() and any(listed.values()):
-        folder = paths[0].parent
-        raise schema.DataError(f"{folder}: holds {files.listing(folder)}, but {FRAME_FILE} names {paths[0].name} and "
-                               f"its like. Rename the files as the table names them, or take the folder away.")
+    folders: dict[str, _Folder] = {}  # by the path in the table
+    for row, relative in enumerate(run.columns[f"{kind}_path"]):
+        head, _, name = _with_slashes(relative).rpartition("/") if isinstance(relative, str) else ("", "", "..")
+        if head not in folders or name == ".." or "\0" in name:
+            path = run.path(kind, row)  # checks it
+            folders[head] = _Folder(path.parent)
+        folder = folders[head]
+        if name in folder.names:
+            present[row] = True
+        elif (found := folder.like(run.path(kind, row), kind)) is not None:
+            present[row], unusual[row] = True, found
+    if run.frames and not present.any() and any(folder.names for folder in folders.values()):
+        path = run.path(kind, 0)
+        raise schema.DataError(f"{path.parent}: holds {files.listing(path.parent)}, but {FRAME_FILE} names {path.name} "
+                               f"and its like. Rename the files as the table names them, or take the folder away.")
     return KindFiles(present, unusual)
 
 
-def _by_stem(folder: pathlib.Path) -> dict[str, dict[str, str]]:
-    """stem -> suffix in lower case -> name, of the files of a folder; empty where there is none."""
-    found: dict[str, dict[str, str]] = {}
-    if folder.is_dir():
-        for name in sorted(os.listdir(folder)):
-            if not name.startswith("."):
-                stem, suffix = os.path.splitext(name)
-                found.setdefault(stem, {}).setdefault(suffix.lower(), name)
-    return found
+class _Folder:
+    """The files of a folder; none where there is no folder."""
+
+    def __init__(self, path: pathlib.Path):
+        self.names = {name for name in os.listdir(path) if not name.startswith(".")} if path.is_dir() else set()
+
+    @functools.cached_property
+    def _by_stem(self) -> dict[str, dict[str, str]]:
+        """stem -> suffix in lower case -> name."""
+        found: dict[str, dict[str, str]] = {}
+        for name in sorted(self.names):
+            stem, suffix = os.path.splitext(name)
+            found.setdefault(stem, {}).setdefault(suffix.lower(), name)
+        return found
+
+    def like(self, path: pathlib.Path, kind: str) -> pathlib.Path | None:
+        """The file that stands in the place of one that the table names: of a suffix in other case, a JPEG image."""
+        names = self._by_stem.get(path.stem, {})
+        suffixes = (path.suffix, *_PICTURES) if path.suffix.lower() in _PICTURES and kind == "image" else (path.suffix,)
+        found = next((names[suffix.lower()] for suffix in suffixes if suffix.lower() in names), None)
+        return None if found is None else path.with_name(found)
 
 
 def numbering(run: Run) -> np.ndarray:
@@ -138,17 +202,22 @@ def numbering(run: Run) -> np.ndarray:
     """
     columns = [column.removesuffix("_path") for column in run.columns if column.endswith("_path")]
     for kind in columns:
+        names = run.columns[f"{kind}_path"]
+        if isinstance(names, NumberedNames):
+            return _increasing(names.numbers, run)
         found = [_NUMBER.search(run.path(kind, row).stem) for row in range(run.frames)]
         if all(found):
-            numbers = np.array([int(match[1]) for match in found if match], np.int64)
-            wrong = np.flatnonzero(np.diff(numbers) <= 0)
-            if wrong.size:
-                row = int(wrong[0]) + 1
-                raise schema.DataError(f"{run.folder / FRAME_FILE}, row {row}: frame {numbers[row]} comes after frame "
-                                       f"{numbers[row - 1]}; rows must be in the order of their recording. Sort the "
-                                       f"table.")
-            return numbers
+            return _increasing(np.array([int(match[1]) for match in found if match], np.int64), run)
     return np.arange(run.frames)
+
+
+def _increasing(numbers: np.ndarray, run: Run) -> np.ndarray:
+    wrong = np.flatnonzero(np.diff(numbers) <= 0)
+    if wrong.size:
+        row = int(wrong[0]) + 1
+        raise schema.DataError(f"{run.folder / FRAME_FILE}, row {row}: frame {numbers[row]} comes after frame "
+                               f"{numbers[row - 1]}; rows must be in the order of their recording. Sort the table.")
+    return numbers
 
 
 def root_levels(path: pathlib.Path) -> int:
@@ -208,8 +277,10 @@ def _read_run(split: str, folder: pathlib.Path) -> Run:
     if lacking:
         raise schema.DataError(f"{path}: column {', '.join(lacking)} is missing; there are "
                                f"{', '.join(columns) or 'none'}.")
+    kept = {name: (NumberedNames.of(cells) or cells) if name.endswith("_path") else cells
+            for name, cells in columns.items() if name in _KEPT or name.endswith("_path")}
     town = folder.resolve().parent.name
-    run = Run(split, f"{split}/{town}/{folder.resolve().name}", folder, columns)
+    run = Run(split, f"{split}/{town}/{folder.resolve().name}", folder, kept)
     run.numbers("reward", 1)  # checked before anything is summed
     return run
 

@@ -8,17 +8,20 @@ wrote the file: frames of pandas 1.5 to 3.1 with NumPy 1.23 to 2.4 were tried.
 
 from __future__ import annotations
 
+import collections
 import io
 import pathlib
 import pickle
 from collections.abc import Callable, Sequence
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
 from muvo_jax.data import files, schema
+from muvo_jax.data.muvo import pickle_repeats as repeats
 from muvo_jax.data.muvo import pickle_standins as standins
 
+_PAYLOADS = 64  # of an item at most, for its copies to be looked for
 _OPCODES = frozenset((
     pickle.PROTO, pickle.FRAME, pickle.STOP, pickle.MARK, pickle.POP, pickle.POP_MARK, pickle.NONE, pickle.NEWTRUE,
     pickle.NEWFALSE, pickle.BININT, pickle.BININT1, pickle.BININT2, pickle.LONG1, pickle.BINFLOAT,
@@ -28,6 +31,13 @@ _OPCODES = frozenset((
     pickle.SETITEMS, pickle.GLOBAL, pickle.STACK_GLOBAL, pickle.REDUCE, pickle.NEWOBJ, pickle.BUILD, pickle.MEMOIZE,
     pickle.BINPUT, pickle.LONG_BINPUT, pickle.BINGET, pickle.LONG_BINGET,
 ))
+
+# How many values below the top of the stack an opcode looks at; all down to the mark where it is a very large number.
+_ALL = 1 << 60
+_OPERANDS = {code[0]: operands for operands, codes in (
+    (1, (pickle.POP, pickle.TUPLE1, pickle.MEMOIZE, pickle.BINPUT, pickle.LONG_BINPUT)),
+    (2, (pickle.TUPLE2, pickle.REDUCE, pickle.NEWOBJ, pickle.BUILD, pickle.STACK_GLOBAL, pickle.APPEND)),
+    (3, (pickle.TUPLE3, pickle.SETITEM)), (_ALL, (pickle.TUPLE, pickle.SETITEMS, pickle.POP_MARK))) for code in codes}
 
 
 def load_table(path: pathlib.Path) -> dict[str, Sequence]:
@@ -73,13 +83,16 @@ def loads(content: bytes, where: str) -> Any:
     Raises:
       Refused: see load_table.
     """
+    unpickler = _Unpickler(content)
     try:
-        return _Unpickler(content).load()
+        return unpickler.load()
     except standins.Refused as error:
         raise standins.Refused(f"{where}: {error} {standins.HOW_TO_GO_ON}") from None
     except Exception as error:  # a malformed stream may raise anything, says the documentation of pickle
         raise standins.Refused(f"{where}: not a readable pickle ({type(error).__name__}: {error}). "
                                f"{standins.HOW_TO_GO_ON}") from error
+    finally:
+        del unpickler.memo  # which refers to it in turn: all that was read would wait for the garbage collector
 
 
 def _content(path: pathlib.Path, what: str) -> bytes:
@@ -94,22 +107,188 @@ def _content(path: pathlib.Path, what: str) -> bytes:
 _Python: Any = pickle._Unpickler  # only in the Python form can opcodes be taken away
 
 
+class _List:
+    """A list whose items are being read: the stack that they gather on, and for each value on it where it began: its
+    offset in the file and the number of its first entry of the memo."""
+
+    def __init__(self, stack: list):
+        self.stack = stack
+        self.begins: list[tuple[int, int]] = []
+
+    def take_apart(self, operands: int) -> None:
+        """Makes single values of items that were read together and turn out to be operands, not items."""
+        for place in range(len(self.stack) - 1, max(len(self.stack) - operands, 0) - 1, -1):
+            if isinstance(self.stack[place], standins.Repeats):
+                singles = self.stack[place].singles()
+                self.stack[place:place + 1] = singles
+                self.begins[place:place + 1] = self.begins[place:place + 1] * len(singles)
+
+    def note(self, offset: int, memo: int) -> None:
+        """After the opcode at `offset`, before which the memo had so many entries."""
+        del self.begins[len(self.stack):]
+        if len(self.stack) > len(self.begins):
+            self.begins.append((offset, memo))
+
+
+class _Skipped(NamedTuple):
+    """Items that were read together: their first entry of the memo, how many each would have made, how many items
+    there are, and where they lie."""
+
+    memo: int
+    memos: int
+    items: int
+    offset: int
+    size: int
+
+
+class _Memo(dict):
+    """What opcodes refer to by number; entries of items that were read together are made when they are asked for."""
+
+    def __init__(self, unpickler: _Unpickler, first: int):
+        super().__init__()
+        self._unpickler, self._first = unpickler, first
+        self.skipped: list[_Skipped] = []
+        self._of_skipped = 0
+
+    @property
+    def next(self) -> int:
+        """The number of the next entry."""
+        return self._first + len(self) + self._of_skipped
+
+    def skip(self, skipped: _Skipped) -> None:
+        if skipped.memos:
+            self.skipped.append(skipped)
+            self._of_skipped += skipped.memos * skipped.items
+
+    def __missing__(self, number: int) -> Any:
+        return self._unpickler.entry(number)
+
+
 class _Unpickler(_Python):
     dispatch: ClassVar[dict[int, Callable]] = {code: work for code, work in _Python.dispatch.items()
                                                if bytes([code]) in _OPCODES}
 
-    def __init__(self, content: bytes):
-        super().__init__(io.BytesIO(content))
-        self._limit = len(content)
+    def __init__(self, content: bytes, first: int = 0, outer: _Unpickler | None = None):
+        """Args:
+          content: the pickle, or an item of a list in it.
+          first, outer: of an item: the number of its first entry of the memo, and who reads the whole.
+        """
+        file = io.BytesIO(content)
+        super().__init__(file)
+        self._content, self._tell, self._seek = content, file.tell, file.seek
+        self.read, self.readinto, self.readline = file.read, file.readinto, file.readline
+        self.metastack: list[list] = []
+        self.stack: list = []
+        self.proto = 0
+        self.append = self.stack.append
+        self.memo = _Memo(self, first)
+        self._outer = outer
+        self._lists: list[_List] = []
+        self._template: repeats.Template | None = None
+        self._payloads: collections.deque[repeats.Payload] = collections.deque(maxlen=_PAYLOADS)
+        self._made_anew: dict[int, Any] = {}
 
     def load(self) -> Any:
+        """The value of the whole pickle; of an item that `entry` needs: None, when it has been read to its end."""
         try:
-            return super().load()
-        except KeyError as error:
-            code = error.args[0] if error.args else None
-            if isinstance(code, int) and code not in self.dispatch:
-                raise standins.Refused(f"uses opcode {bytes([code])!r}, which data does not need.") from error
-            raise
+            while self._outer is None or self._tell() < len(self._content):
+                offset = self._tell()
+                if self._lists and self._lists[-1].stack is self.stack and self._read_copies(offset):
+                    continue
+                code, memo = self._opcode(), self.memo.next
+                if code in _OPERANDS and self._lists and self._lists[-1].stack is self.stack:
+                    self._lists[-1].take_apart(_OPERANDS[code])
+                self.dispatch[code](self)
+                self._watch(code, offset, memo)
+        except pickle._Stop as stop:  # type: ignore[attr-defined]
+            return stop.value
+
+    def _opcode(self) -> int:
+        code = self.read(1)
+        if not code:
+            raise EOFError
+        if code[0] not in self.dispatch:
+            raise standins.Refused(f"uses opcode {code!r}, which data does not need.")
+        return code[0]
+
+    def _watch(self, code: int, offset: int, memo: int) -> None:
+        """Keeps track of which bytes made which item of a list."""
+        if code == pickle.MARK[0] and self.metastack[-1] and isinstance(self.metastack[-1][-1], list):
+            self._lists.append(_List(self.stack))
+            self._payloads.clear()
+            return
+        while len(self._lists) > 1 and self._lists[-2].stack is self.stack:
+            self._lists.pop()
+        if self._lists and self._lists[-1].stack is self.stack:
+            self._lists[-1].note(offset, memo)
+
+    def _read_copies(self, offset: int) -> bool:
+        """Reads the items at `offset` that are copies of the one before, or of the last that had copies, if any are."""
+        begins, value = self._lists[-1].begins, self.stack[-1] if self.stack else None
+        copies = self._template.copies(self._content, offset) if self._template else None
+        if copies is None and begins and not isinstance(value, standins.Repeats):
+            template = self._template_before(offset, *begins[-1], value)
+            copies = template.copies(self._content, offset) if template else None
+            self._template = template if copies else self._template
+        if copies is None or self._template is None:
+            return False
+        size = self._template.size
+        self.memo.skip(_Skipped(self.memo.next, self._template.memos, len(copies), offset, size))
+        self._seek(offset + len(copies) * size)
+        self.append(copies)
+        begins.append((offset, self.memo.next))
+        self._payloads.clear()
+        return True
+
+    def _template_before(self, offset: int, start: int, memo: int, value: Any) -> repeats.Template | None:
+        size, content = offset - start, self._content
+        if size > repeats.LONGEST_BYTES or content[start:start + 2] != content[offset:offset + 2] or (
+                content[offset - 1:offset] != content[offset + size - 1:offset + size]):
+            return None
+        return repeats.Template.of(content, start, offset, value, self._payloads, self.memo.next - memo)
+
+    def entry(self, number: int) -> Any:
+        """An entry of the memo that reading an item by itself makes.
+
+        Raises:
+          KeyError: where there is none.
+        """
+        if self._outer is not None:
+            return self._outer.memo[number]
+        if number not in self._made_anew:
+            skipped = next((skipped for skipped in self.memo.skipped
+                            if skipped.memo <= number < skipped.memo + skipped.memos * skipped.items), None)
+            if skipped is None:
+                raise KeyError(number)
+            item = (number - skipped.memo) // skipped.memos
+            first, offset = skipped.memo + item * skipped.memos, skipped.offset + item * skipped.size
+            inner = _Unpickler(self._content[offset:offset + skipped.size], first, self)
+            inner.load()
+            self._made_anew |= inner.memo
+        return self._made_anew[number]
+
+    def note_payload(self, is_text: bool) -> None:
+        """Keeps where the payload lies that is last on the stack."""
+        value, stop = self.stack[-1], self._tell()
+        size = len(value.encode("utf-8", "surrogatepass") if is_text else value)
+        self._payloads.append(repeats.Payload(stop - size, stop, is_text))
+
+    def load_frame(self) -> None:
+        self.read(8)  # how much to read ahead, which is all in memory
+
+    def load_memoize(self) -> None:
+        self._remember(self.memo.next)
+
+    def load_binput(self) -> None:
+        self._remember(self.read(1)[0])
+
+    def load_long_binput(self) -> None:
+        self._remember(int.from_bytes(self.read(4), "little"))
+
+    def _remember(self, number: int) -> None:
+        if isinstance(self.stack[-1], standins.Repeats):
+            raise standins.Refused("refers to items of a list that are not the last.")
+        self.memo[number] = self.stack[-1]
 
     def find_class(self, module: str, name: str) -> Callable:
         made = standins.NAMES.get((module, name))
@@ -148,13 +327,29 @@ class _Unpickler(_Python):
 
     def load_bytearray8(self) -> None:
         size = int.from_bytes(self.read(8), "little")
-        if size > self._limit:
+        if size > len(self._content):
             raise standins.Refused(f"says that it holds {size} bytes, more than the file has.")
         self.append(self.read(size))
 
     dispatch |= {pickle.REDUCE[0]: load_reduce, pickle.NEWOBJ[0]: load_newobj, pickle.BUILD[0]: load_build,
                  pickle.BYTEARRAY8[0]: load_bytearray8, pickle.SETITEM[0]: load_setitem,
-                 pickle.SETITEMS[0]: load_setitems}
+                 pickle.SETITEMS[0]: load_setitems, pickle.FRAME[0]: load_frame, pickle.MEMOIZE[0]: load_memoize,
+                 pickle.BINPUT[0]: load_binput, pickle.LONG_BINPUT[0]: load_long_binput}
+
+
+def _noting(work: Callable[[_Unpickler], None], is_text: bool) -> Callable[[_Unpickler], None]:
+    """An opcode that pushes a payload, which also keeps where it lies."""
+
+    def load(unpickler: _Unpickler) -> None:
+        work(unpickler)
+        unpickler.note_payload(is_text)
+
+    return load
+
+
+for _code, _is_text in ((pickle.SHORT_BINBYTES, False), (pickle.BINBYTES, False), (pickle.BYTEARRAY8, False),
+                        (pickle.SHORT_BINUNICODE, True), (pickle.BINUNICODE, True)):
+    _Unpickler.dispatch[_code[0]] = _noting(_Unpickler.dispatch[_code[0]], _is_text)
 
 
 def _call(function: Any, arguments: Any) -> Any:

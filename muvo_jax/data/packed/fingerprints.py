@@ -20,15 +20,23 @@ def of_runs(source: pathlib.Path, runs: Collection[str]) -> dict[str, str]:
     for folder, names in _walk(source):
         run = _run_of(folder.relative_to(source).parts, folders)
         state = shared if run is None else states[run]
-        for name in names:
-            path = folder / name
-            try:
-                stat = path.stat()
-            except OSError:  # a link to nowhere
-                continue
-            state.append(f"{path.relative_to(source).as_posix()} {stat.st_size} {stat.st_mtime_ns}")
+        state += _states(source, (folder / name for name in names))
     common = combined(shared)
     return {run: combined([common, *state]) for run, state in states.items()}
+
+
+def of_files(source: pathlib.Path, paths: Iterable[pathlib.Path]) -> str:
+    """The fingerprint of some files, by their paths as seen from the source."""
+    return combined(_states(source, paths))
+
+
+def _states(source: pathlib.Path, paths: Iterable[pathlib.Path]) -> Iterator[str]:
+    for path in paths:
+        try:
+            stat = path.stat()
+        except OSError:  # a link to nowhere
+            continue
+        yield f"{pathlib.PurePath(os.path.relpath(path, source)).as_posix()} {stat.st_size} {stat.st_mtime_ns}"
 
 
 def combined(texts: Iterable[str]) -> str:

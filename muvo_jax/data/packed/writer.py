@@ -36,12 +36,14 @@ class Shard(NamedTuple):
 
 
 def pack(source: pathlib.Path | str, out: pathlib.Path | str, *, encoding: records.Encoding | None = None,
-         frames_per_shard: int = manifest.FRAMES_PER_SHARD, camera: str = "", labels: bool = True, machine: int = 0,
-         machines: int = 1, workers: int | None = None, progress: Progress | None = None) -> bool:
+         frames_per_shard: int = manifest.FRAMES_PER_SHARD, camera: str = "", key_frames: bool = False,
+         labels: bool = True, machine: int = 0, machines: int = 1, workers: int | None = None,
+         progress: Progress | None = None) -> bool:
     """Packs a recording of any kind; shards that are complete already are kept.
 
     Args:
       camera: which one, where the source has several; by default its reader's choice.
+      key_frames: only these, where the source has them.
       labels: whether to pack what schema.LABELS names, too, as far as it is recorded.
       machine, machines: this call writes the shards whose number is `machine` modulo `machines`.
       workers: how many shards are packed side by side, by default one for each processor.
@@ -63,7 +65,8 @@ def pack(source: pathlib.Path | str, out: pathlib.Path | str, *, encoding: recor
     encoding = encoding or records.Encoding()
     source, out = pathlib.Path(source).expanduser(), pathlib.Path(out).expanduser()
     _check_apart(source, out)
-    recording = sources.open_recording(source, camera=camera, labels=schema.LABELS if labels else ())
+    recording = sources.open_recording(source, camera=camera, key_frames=key_frames,
+                                       labels=schema.LABELS if labels else ())
     plan = _plan(recording, frames_per_shard, encoding)
     out.mkdir(parents=True, exist_ok=True)
     with processes.locked(out / f".packing-{machine}-of-{machines}", "packing"):
@@ -180,7 +183,9 @@ def _shards(recording: schema.Recording, source: pathlib.Path, frames_per_shard:
             groups[-1].append((sequence, start, stop))
             room -= stop - start
             start = stop
-    states = fingerprints.of_runs(source, {sequence.name for sequence in recording.sequences})
+    names = {sequence.name for sequence in recording.sequences}
+    states = ({name: fingerprints.of_files(source, recording.run_files(name)) for name in names}
+              if isinstance(recording, schema.ListsFiles) else fingerprints.of_runs(source, names))
     return [Shard(number, tuple(parts), fingerprints.combined(
         [f"{sequence.name}/{sequence.start + start}+{stop - start}:{states[sequence.name]}"
          for sequence, start, stop in parts])) for number, parts in enumerate(groups)]

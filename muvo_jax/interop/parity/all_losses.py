@@ -66,7 +66,7 @@ def _labels(context: cases.Context) -> dict[str, np.ndarray]:
 
 def _latent_and_action(context: cases.Context, action: np.ndarray) -> Terms:
     frames = action.shape[:2]
-    shape = (*frames, config_lib.ModelConfig().stochastic_channels)
+    shape = (*frames, config_lib.VectorLatent().stochastic_channels)
     posterior, prior = (types.Gaussian(*(jnp.asarray(context.draw(f"o_{side}_{moment}", shape, kind))
                                          for moment, kind in (("mu", "normal"), ("sigma", "sigma"))))
                         for side in ("posterior", "prior"))

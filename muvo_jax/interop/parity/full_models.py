@@ -33,9 +33,9 @@ def config_of(name: str) -> config_lib.ModelConfig:
 
 def tolerance_of(config: config_lib.ModelConfig, entry: str) -> float:
     """As the page of the golden files says: lifting and adaptive norms, of the 1D voxel head, amplify float32 noise."""
-    if config.camera == "bev":
+    if isinstance(config.camera, config_lib.BirdsEyeCamera):
         return BEV_TOLERANCE
-    return STYLED_TOLERANCE if "/voxel_" in entry and config.latent == "1d" else TOLERANCE
+    return STYLED_TOLERANCE if "/voxel_" in entry and isinstance(config.latent, config_lib.VectorLatent) else TOLERANCE
 
 
 def checks(context: cases.Context) -> Checks:
@@ -59,7 +59,7 @@ def model_checks(context: cases.Context, config: config_lib.ModelConfig, variabl
     frames = raw["image"].shape[1]
     for entry, value in reference_preprocess.network_inputs(raw).items():
         yield cases.Check(f"in/{entry}", value, tolerance_of(config, f"in/{entry}"))
-    more = raw_batch.points(context, frames) if config.lidar == "pp" else {}
+    more = raw_batch.points(context, frames) if isinstance(config.lidar, config_lib.PillarLidar) else {}
     if config.navigation:
         more |= raw_batch.navigation(context, frames)
     batch, model = raw_batch.model_batch(raw, **more), world_model.WorldModel(config)
@@ -101,7 +101,7 @@ def _encoded(context: cases.Context, config: config_lib.ModelConfig, encode: Cal
     """
     tolerance, note = tolerance_of(config, "embedding"), ""
     embedding = encode(variables)
-    if config.camera == "bev" and "embedding" in context.file:
+    if isinstance(config.camera, config_lib.BirdsEyeCamera) and "embedding" in context.file:
         error = lambda value: context.file.error("embedding", latent_layout(value))
         first = error(embedding)
         others = rounding.anew(variables, size=rounding.NETWORK_NOISE) if first > tolerance else ()
@@ -146,7 +146,7 @@ def _dream(model: world_model.WorldModel, variables: Any, state: LatentState, dr
     hidden, sample = (latent_layout(value) for value in (dream.states.deterministic, dream.states.stochastic))
     yield f"{prefix}/hidden", hidden
     yield f"{prefix}/sample", sample
-    tokens = model.config.latent == "2d"
+    tokens = isinstance(model.config.latent, config_lib.TokenLatent)
     yield f"{prefix}/state", sample if tokens else np.concatenate([hidden, sample], axis=-1)
     yield f"{prefix}/action", dream.actions[..., None] if tokens else dream.actions
     yield from prediction_entries(prefix, rollout.decode(model, variables, dream.states, heads), model.config)

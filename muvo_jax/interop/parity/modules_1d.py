@@ -17,7 +17,8 @@ from muvo_jax.types import StepNoise
 
 TOLERANCE = 1e-4
 STYLED_TOLERANCE = 5e-4  # adaptive instance norms amplify float32 noise
-CONFIG = config_lib.ModelConfig(numerics="reference")
+FUSION, LATENT = config_lib.TransformerFusion(), config_lib.VectorLatent()
+CONFIG = config_lib.ModelConfig(numerics="reference", fusion=FUSION, latent=LATENT)
 _EVAL = (drawing.EVAL,)
 _FPN_CHANNELS = (128, 256, 512)
 Checks = Iterator[cases.Check]
@@ -40,18 +41,17 @@ def necks(context: cases.Context) -> Checks:
     for name, prefix, neck in (("DecoderDS", "feat_decoder", pyramid.DownsamplingPyramid),
                                ("Decoder", "feat_decoder_full", pyramid.UpsamplingPyramid)):
         rename = lambda key, prefix=prefix: key.replace("feat_decoder", prefix)
-        out = drawing.run(neck(CONFIG.token_channels), maps, where="camera/neck/", rename=rename, static=_EVAL)
+        out = drawing.run(neck(FUSION.token_channels), maps, where="camera/neck/", rename=rename, static=_EVAL)
         yield cases.Check(f"{name}/out", drawing.channels_first(out), TOLERANCE)
 
 
 def transformer(context: cases.Context) -> Checks:
     shape = context.shape("transformer_encoder/out", "transformer_encoder/layer0") or context.size("p3_1d", "tokens")
     tokens = np.swapaxes(context.draw("tokens", shape, "normal"), 0, 1)
-    size = (CONFIG.transformer_heads, CONFIG.transformer_hidden_channels, 0.0)
+    size = (FUSION.heads, FUSION.hidden_channels, 0.0)
     first = drawing.run(attention.EncoderLayer(*size), tokens, where="fusion/transformer/layer0/", static=(None, 0))
     yield cases.Check("transformer_encoder/layer0", np.swapaxes(first, 0, 1), TOLERANCE)
-    out = drawing.run(attention.TransformerEncoder(CONFIG.transformer_layers, *size), tokens,
-                      where="fusion/transformer/")
+    out = drawing.run(attention.TransformerEncoder(FUSION.layers, *size), tokens, where="fusion/transformer/")
     yield cases.Check("transformer_encoder/out", np.swapaxes(out, 0, 1), TOLERANCE)
 
 
@@ -65,7 +65,7 @@ def compression(context: cases.Context) -> Checks:
             rows = halved[0]
             size = size if halved[2:] == tuple(-(-side // 2) for side in size) else tuple(2 * n for n in halved[2:])
         x = drawing.channels_last(context.draw(f"{name}_in", (rows, channels, *size), "normal"))
-        blocks = [resnet.BasicBlock(CONFIG.fused_channels, stride=stride, project=stride == 2)
+        blocks = [resnet.BasicBlock(LATENT.fused_channels, stride=stride, project=stride == 2)
                   for stride in (2, second_stride)]
         first = drawing.run(blocks[0], x, prefix=f"{name}.0.", static=_EVAL)
         yield cases.Check(f"{name}/block0", drawing.channels_first(first), TOLERANCE)
@@ -90,7 +90,7 @@ def measurements(context: cases.Context) -> Checks:
 
 def decoded(context: cases.Context) -> Checks:
     count, *_ = context.shape("policy/out") or (context.size("p3_1d", "state_batch"),)
-    state = context.draw("state", (count, CONFIG.deterministic_channels + CONFIG.stochastic_channels), "normal")
+    state = context.draw("state", (count, LATENT.deterministic_channels + LATENT.stochastic_channels), "normal")
 
     def plane(entry: str, usual: tuple[int, ...], channels: int) -> decoders.PlaneDecoder:
         rows, columns = (context.shape(f"{entry}_1") or usual)[-2:]
@@ -98,7 +98,7 @@ def decoded(context: cases.Context) -> Checks:
 
     yield drawing.action_check("policy/out", decoders.ActionDecoder(), state, "decoders_action/", TOLERANCE)
     voxels = decoders.StyledDecoder(CONFIG.voxels.shape, 2, 2 * CONFIG.occupancy_channels, CONFIG.occupancy_channels,
-                                    CONFIG.occupancy_blocks)
+                                    LATENT.occupancy_blocks)
     for module, rows, where, name, tolerance in (
             (plane("rgb_decoder/rgb", CONFIG.image_size, 3), state[:1], "decoders_image/", "rgb_decoder/rgb",
              TOLERANCE),
@@ -116,7 +116,7 @@ def decoded(context: cases.Context) -> Checks:
 def recurrent(context: cases.Context) -> Checks:
     sizes = transition_sizes(context, "rssm", "p3_1d", "rssm")
     yield from transition_checks(context, CONFIG, "rssm", "rssm", *sizes,
-                                 embedding=context.draw("rssm_emb", (*sizes[:2], CONFIG.embedding_channels), "normal"))
+                                 embedding=context.draw("rssm_emb", (*sizes[:2], LATENT.embedding_channels), "normal"))
 
 
 def transition_sizes(context: cases.Context, label: str, *path: str) -> tuple[int, int, int]:

@@ -14,8 +14,10 @@ from muvo_jax.model import decoders, token_transition
 from muvo_jax.nn import resnet
 
 TOLERANCE, STYLED_TOLERANCE = modules_1d.TOLERANCE, modules_1d.STYLED_TOLERANCE
-CONFIG = config_lib.ModelConfig(latent="2d", numerics="reference")
-NARROW = dataclasses.replace(CONFIG, token_channels=48)  # the file's small transition: 48 channels everywhere
+FUSION = config_lib.TransformerFusion()
+CONFIG = config_lib.ModelConfig(latent=config_lib.TokenLatent(), fusion=FUSION, numerics="reference")
+# The file's small transition: 48 channels everywhere.
+NARROW = dataclasses.replace(CONFIG, fusion=config_lib.TransformerFusion(token_channels=48))
 Checks = Iterator[cases.Check]
 
 
@@ -56,7 +58,8 @@ def transition(context: cases.Context) -> Checks:
 def _transition(context: cases.Context, name: str, config: config_lib.ModelConfig, rename) -> Checks:
     sizes = modules_1d.transition_sizes(context, f"rssmtd{name}", "p3_2d", f"rssmtd{name}")
     tokens = context.size("p3_2d", f"rssmtd{name}", "tokens")
-    embedding = context.draw(f"td{name}_emb", (*sizes[:2], config.token_channels, tokens), "normal")
+    _, channels = token_transition.TokenTransition.state_shapes(config)[0]
+    embedding = context.draw(f"td{name}_emb", (*sizes[:2], channels, tokens), "normal")
     yield from modules_1d.transition_checks(
         context, config, f"td{name}", f"rssmtd{name}", *sizes, embedding=np.swapaxes(embedding, 2, 3), rename=rename,
         moved=lambda value: np.swapaxes(value, 2, 3))
@@ -71,7 +74,7 @@ def decoded(context: cases.Context) -> Checks:
             (plane(4, 1), 16, (4, 64), "decoders_range_view/", "lidar_re", "lidar_reconstruction"),
             (voxels, 16, (12, 12, 4), "decoders_occupancy/", "voxel_decoder", "voxel")):
         grid = _grid(context, f"{name}/{entry}_1", factor) or usual
-        tokens = drawing.channels_last(context.draw(f"{name}_in", (1, CONFIG.token_channels, *grid), "normal"))
+        tokens = drawing.channels_last(context.draw(f"{name}_in", (1, FUSION.token_channels, *grid), "normal"))
         for scale, value in drawing.run(module, tokens, where=where).items():
             tolerance = STYLED_TOLERANCE if name == "voxel_decoder" else TOLERANCE
             yield cases.Check(f"{name}/{entry}_{scale}", drawing.channels_first(value), tolerance)
@@ -79,12 +82,12 @@ def decoded(context: cases.Context) -> Checks:
     birds_eye = decoders.TokenDecoder(channels, width, width, 1, head=decoders.BirdsEyeHead)
     # The file feeds the ground plan itself.
     grid = _grid(context, "bev_decoder/bev_segmentation_1", 16) or (12, 12)
-    plan = drawing.channels_last(context.draw("bev_decoder_in", (1, CONFIG.token_channels, *grid), "normal"))
+    plan = drawing.channels_last(context.draw("bev_decoder_in", (1, FUSION.token_channels, *grid), "normal"))
     for entry, value in drawing.birds_eye_entries("bev_decoder", drawing.run(
             birds_eye, plan, where="decoders_birds_eye/"), 1):
         yield cases.Check(entry, value, TOLERANCE)
     count, *_ = context.shape("policy/out") or (3,)
-    tokens = context.draw("pol_in", (count, CONFIG.token_channels), "normal")
+    tokens = context.draw("pol_in", (count, FUSION.token_channels), "normal")
     yield drawing.action_check("policy/out", decoders.ActionDecoder(), tokens, "decoders_action/", TOLERANCE)
 
 

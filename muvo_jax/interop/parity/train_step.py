@@ -52,7 +52,8 @@ def _step(context: cases.Context) -> Checks:
     latent = "2d" if context.file.path.stem.endswith("2d") else "1d"
     shape = context.shape("out/throttle_brake", "out/steering", "out/posterior/mu")
     frames = shape[1] if shape else context.size("p5", f"train_step_{latent}_sequence")
-    config = config_lib.ModelConfig(latent=latent, numerics="reference", dropout=0.0, prior_dropout=0.0)
+    config = config_lib.ModelConfig(latent=config_lib.LATENTS[latent](), numerics="reference", prior_dropout=0.0,
+                                    fusion=config_lib.TransformerFusion(dropout=0.0))
     model = world_model.WorldModel(config)
     variables = jax.tree.map(jnp.asarray, drawing.draw_variables(model.variable_shapes()))
     batch = raw_batch.model_batch(raw_batch.draw_raw(context, frames, context.size("p4", "imagine")))
@@ -173,14 +174,13 @@ def _gradients(context: cases.Context, gradients: Any) -> Checks:
 
 def _update(context: cases.Context, params: Any, gradients: Any) -> Checks:
     """One AdamW step with the reference's two groups; weight decay spares parameters with one axis."""
-    adamw = optax.adamw(_RATE, b1=0.9, b2=0.999, eps=_EPSILON, weight_decay=0.01,
-                        mask={"decayed": True, "undecayed": False})
+    adamw = optimizer_lib.packed(optax.adamw(_RATE, b1=0.9, b2=0.999, eps=_EPSILON, weight_decay=0.01,
+                                             mask=optimizer_lib.decays))
 
     @jax.jit
     def update(params, gradients):
-        packed = optimizer_lib.pack(params)
-        updates, _ = adamw.update(optimizer_lib.pack(gradients), adamw.init(packed), packed)
-        return optimizer_lib.unpack(updates, params)
+        updates, _ = adamw.update(gradients, adamw.init(params), params)
+        return updates
 
     signed = jax.tree_util.tree_map_with_path(functools.partial(_signed, context.file), gradients)
     moved = dict(_by_reference_key({"params": update(params, signed)}))
@@ -214,9 +214,9 @@ def _groups(latent: str) -> Checks:
     manifest = golden.manifest("2d_RV_WOB_TR_voxel" if latent == "2d" else "1d_RV_WOB_TR_voxel")
     buffers = ("running_mean", "running_var", "num_batches_tracked")
     shapes = [shape for key, shape in manifest.items() if not key.endswith(buffers)]
-    packed = optimizer_lib.group_of
-    yield cases.Check("groups/n_decay", sum(packed(len(shape)) == "decayed" for shape in shapes), 0.0)
-    yield cases.Check("groups/n_no_decay", sum(packed(len(shape)) == "undecayed" for shape in shapes), 0.0)
+    groups = [optimizer_lib.group_of(len(shape)) for shape in shapes]
+    yield cases.Check("groups/n_decay", groups.count("decayed"), 0.0)
+    yield cases.Check("groups/n_no_decay", groups.count("undecayed"), 0.0)
 
 
 def schedules(context: cases.Context) -> Checks:

@@ -1,19 +1,18 @@
 """The KITTI raw reader on a synthetic drive; the real excerpt where it is present."""
 
 import math
-import os
-import pathlib
 import shutil
 import warnings
 
 import numpy as np
 import pytest
+import recording_samples as samples
 import recording_writers as writers
 from PIL import Image
 
 from muvo_jax import config as config_lib
 from muvo_jax import presets
-from muvo_jax.data import fitting, prepare, schema, sources
+from muvo_jax.data import ego_motion, fitting, prepare, schema, sources
 from muvo_jax.data.kitti import reader as kitti_reader
 from muvo_jax.ops import camera as camera_ops
 
@@ -69,8 +68,8 @@ def test_actions_are_derived_from_the_motion(drive):
     np.testing.assert_array_equal(recording.action(recording.sequences[0], 0), action)
     # -1.2 m/s2 of 6 is a brake of 0.2; turning right (yaw rate -0.1 at 10 m/s) is steering to the right, > 0.
     np.testing.assert_allclose(action, [-0.2, math.atan(2.71 * 0.1 / 10) / 0.6], rtol=1e-6)
-    np.testing.assert_array_equal(kitti_reader.derive_action(0.1, 99.0, 9.0, contract), [1.0, -1.0])
-    assert kitti_reader.derive_action(5.0, 1.5, 0.0, contract)[0] == pytest.approx(0.5)
+    np.testing.assert_array_equal(ego_motion.derive_action(0.1, 99.0, 9.0, contract), [1.0, -1.0])
+    assert ego_motion.derive_action(5.0, 1.5, 0.0, contract)[0] == pytest.approx(0.5)
 
 
 def test_returns_of_the_own_car_are_left_out(drive):
@@ -116,8 +115,8 @@ def test_a_sensor_may_be_missing_altogether(drive, absent, modality):
     assert (recording.description.lidar is None) == (absent == "velodyne_points")
     assert (recording.description.camera is None) == (absent == "image_02")
     model = fitting.adapt(config_lib.override(presets.get("tiny"), "data.stride", 1), recording).config.model
-    assert (model.camera == "none", model.lidar == "none") == (absent == "image_02", absent == "velodyne_points")
-    assert model.heads == (("range_view", "occupancy", "action") if model.camera == "none" else ("image", "action"))
+    assert (model.camera is None, model.lidar is None) == (absent == "image_02", absent == "velodyne_points")
+    assert model.heads == (("range_view", "occupancy", "action") if model.camera is None else ("image", "action"))
 
 
 def test_a_drive_without_image_and_scan_is_refused(drive):
@@ -231,18 +230,11 @@ def test_a_few_nan_points_are_dropped_and_counted(drive):
         assert kitti_reader.read_scan(path).shape == (199, 3)
 
 
-def real_excerpt() -> pathlib.Path | None:
-    """MUVO_KITTI, or a kitti_raw folder beside the repository."""
-    repository = pathlib.Path(__file__).parents[3]
-    candidates = [os.environ.get("MUVO_KITTI"), *repository.parent.glob("*/data/kitti_raw")]
-    return next((pathlib.Path(path) for path in candidates if path and pathlib.Path(path).is_dir()), None)
-
-
-@pytest.mark.skipif(real_excerpt() is None, reason="no real KITTI drive here; name one by MUVO_KITTI=FOLDER")
+@pytest.mark.skipif(samples.KITTI is None, reason="no real KITTI drive here; name one by MUVO_KITTI=FOLDER")
 def test_a_real_drive():
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        recording = sources.open_recording(real_excerpt())
+        recording = sources.open_recording(samples.KITTI)
     config, _ = fitting.adapt(presets.get("town"), recording)
     frame = prepare.prepare_frame(recording.read(recording.sequences[0], 0), config)
     camera_position_m = np.array(recording.description.camera.camera_to_ego)[:3, 3]

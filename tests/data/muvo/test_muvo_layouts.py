@@ -12,7 +12,7 @@ from muvo_jax.data import schema, sources
 from muvo_jax.data.carla import recorder as carla_recorder
 from muvo_jax.data.muvo import exporter as muvo_exporter
 from muvo_jax.data.muvo import files as muvo_files
-from muvo_jax.data.muvo import frame_pickle
+from muvo_jax.data.muvo import frame_pickle, safe_pickle
 from muvo_jax.data.muvo import reader as muvo_reader
 from muvo_jax.data.muvo import runs as muvo_runs
 from muvo_jax.data.muvo import tags as muvo_tags
@@ -214,10 +214,11 @@ def test_an_export_says_the_weather_and_the_town_of_each_run(tmp_path):
                           "route_map": np.zeros((64, 64), np.uint8)})
         writer.close()
     muvo_exporter.export(source, tmp_path / "out", town="Town05")
-    runs = {run.folder.parent.name: run for run in muvo_runs.find_runs(tmp_path / "out")}
-    assert {town: set(run.columns["weather"]) for town, run in runs.items()} == {
+    tables = {run.folder.parent.name: safe_pickle.load_table(run.folder / muvo_runs.FRAME_FILE)
+              for run in muvo_runs.find_runs(tmp_path / "out")}
+    assert {town: set(table["weather"]) for town, table in tables.items()} == {
         "Town03": {"WetNoon"}, "Town06": {"ClearSunset"}, "Town05": {"ClearNoon"}}
-    assert {town: set(run.columns["town"]) for town, run in runs.items()} == {town: {town} for town in runs}
+    assert {town: set(table["town"]) for town, table in tables.items()} == {town: {town} for town in tables}
     recording = muvo_reader.MuvoRecording(tmp_path / "out", skipped_s=0.0, labels=frozenset(
         {"image_classes", "image_instance_mask", "point_classes"}))
     frame = recording.read(recording.sequences[0], 0)

@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from muvo_jax.data import schema
-from muvo_jax.data.muvo import pickle_standins, safe_pickle
+from muvo_jax.data.muvo import frame_pickle, pickle_repeats, pickle_standins, safe_pickle
 
 FOLDER = pathlib.Path(__file__).parents[2] / "golden" / "pickles"
 FRAMES = sorted(FOLDER.glob("*.pkl"))
@@ -45,6 +45,77 @@ def test_plain_arrays(tmp_path):
     for array in (np.arange(8, dtype=np.uint16).reshape(2, 4), np.asfortranarray(np.eye(3)), np.zeros((0, 4), ">u2")):
         np.save(tmp_path / "a.npy", array)
         np.testing.assert_array_equal(safe_pickle.load_npy(tmp_path / "a.npy"), array)
+
+
+def long_frame(rows=2500):
+    """A frame whose columns repeat themselves but for their content, and some whose do not quite."""
+    random = np.random.default_rng(0)
+    same = [80, 160]
+    return frame_pickle.frame({
+        "action": list(random.normal(size=(rows, 3)).astype(np.float32)),
+        "speed": [np.array([row], ">f8") for row in range(rows)],
+        "image_path": [f"image/image_{row:09d}.png" for row in range(rows)], "name": [f"ä{row}" for row in range(rows)],
+        "uneven": [np.arange(row % 3 + 1) for row in range(rows)], "command": [np.array([4], np.int8)] * rows,
+        "n_vehicles": [same] * rows, "reward": random.normal(size=rows), "lists": [[row, 2] for row in range(rows)]})
+
+
+def test_columns_that_repeat_are_read_at_once_and_the_same(monkeypatch, tmp_path):
+    opcodes, step = [], safe_pickle._Unpickler._opcode
+    monkeypatch.setattr(safe_pickle._Unpickler, "_opcode", lambda self: opcodes.append(0) or step(self))
+    (tmp_path / "f.pkl").write_bytes(long_frame())
+    together = safe_pickle.load_table(tmp_path / "f.pkl")
+    count = len(opcodes)
+    monkeypatch.setattr(pickle_repeats, "LONGEST_BYTES", 0)
+    one_by_one = safe_pickle.load_table(tmp_path / "f.pkl")
+    assert count < 0.4 * (len(opcodes) - count), "only lists and arrays of several sizes are read one by one"
+    assert together["action"].shape == (2500, 3) and together["speed"].dtype == np.float64
+    assert_same_tables(together, one_by_one)
+
+
+def assert_same_tables(one, other):
+    assert list(one) == list(other)
+    for name in one:
+        assert type(one[name]) is type(other[name]) and len(one[name]) == len(other[name])
+        for mine, theirs in zip(one[name], other[name], strict=True):
+            assert type(mine) is type(theirs)
+            np.testing.assert_array_equal(mine, theirs)
+
+
+@pytest.mark.parametrize("protocol", [3, 4, 5])
+def test_items_that_were_read_at_once_may_be_referred_to(protocol, tmp_path):
+    arrays = [np.array([row, 0, 1], np.float32) for row in range(300)]
+    names = [f"name {row:03d}" for row in range(300)]
+    content = pickle.dumps({"arrays": arrays, "names": names, "again": arrays[::-7] + names[::-7], "last": arrays[-1]},
+                           protocol)
+    (tmp_path / "f.npy").write_bytes(object_header() + content)
+    read = safe_pickle.load_npy(tmp_path / "f.npy")
+    expected = pickle.loads(content)
+    for name in ("arrays", "again"):
+        assert len(read[name]) == len(expected[name])
+        for mine, theirs in zip(read[name], expected[name], strict=True):
+            np.testing.assert_array_equal(mine, theirs)
+    assert read["names"] == names and read["last"].tolist() == [299, 0, 1]
+
+
+@settings(max_examples=60, deadline=None)
+@given(data=st.data())
+def test_damaged_repeats_are_refused_or_read_as_one_by_one(data, tmp_path_factory):
+    content = bytearray(long_frame(40))
+    for _ in range(data.draw(st.integers(1, 3))):
+        position = data.draw(st.integers(0, len(content) - 1))
+        if data.draw(st.booleans()):
+            content[position] = data.draw(st.integers(0, 255))
+        else:
+            del content[position:position + data.draw(st.integers(1, 40))]
+    damaged = tmp_path_factory.getbasetemp() / "repeats.pkl"
+    damaged.write_bytes(content)
+    try:
+        together = safe_pickle.load_table(damaged)
+    except schema.DataError:
+        return
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(pickle_repeats, "LONGEST_BYTES", 0)
+        assert_same_tables(together, safe_pickle.load_table(damaged))
 
 
 class Runs:

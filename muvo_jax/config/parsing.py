@@ -9,6 +9,7 @@ import typing
 from collections.abc import Mapping
 from typing import Any, Literal
 
+from muvo_jax.config import parts
 from muvo_jax.limits import RangeError
 
 
@@ -29,7 +30,7 @@ def parse(cls, values: dict[str, Any], path: str):
     """
     if not isinstance(values, dict):
         raise ValueError(f"{path}: got {values!r}, expected the fields of {cls.__name__}.")
-    hints = typing.get_type_hints(cls)
+    hints = {field.name: typing.get_type_hints(cls)[field.name] for field in dataclasses.fields(cls) if field.init}
     for name in values:
         check_choice(f"{path} ({cls.__name__})", name, tuple(hints))
     fields = {name: _coerce(hints[name], value, f"{path}.{name}") for name, value in values.items()}
@@ -39,31 +40,12 @@ def parse(cls, values: dict[str, Any], path: str):
         raise ValueError(f"{path}.{error.field}{error.problem}") from error
 
 
-def override(config, dotted: str, value: Any):
-    """Returns `config` with one dotted field replaced: `override(config, "model.dropout", 0.0)`.
-
-    Raises:
-      ValueError: for an unknown field, naming the nearest known one, or a value of the wrong type.
-    """
-    return override_all(config, {dotted: value})
-
-
-def override_all(config, settings: Mapping[str, Any]):
-    """`override` with several fields at once: only the result must make sense, not each step on the way."""
-    values = dataclasses.asdict(config)
-    for dotted, value in settings.items():
-        node = values
-        *parents, leaf = dotted.split(".")
-        for name in parents:
-            check_choice(f"field of {dotted!r}", name, tuple(node))
-            node = node[name]
-        check_choice(f"field of {dotted!r}", leaf, tuple(node))
-        node[leaf] = value
-    return parse(type(config), values, "config")
-
-
 def _coerce(hint, value, path: str):
     """Returns `value` as `hint` wants it (JSON lists become tuples, whole floats stay floats), or raises."""
+    if dataclasses.is_dataclass(value) and isinstance(value, hint):
+        return value
+    if kinds := parts.kinds(hint):
+        return None if value is None and type(None) in typing.get_args(hint) else _part(kinds, value, path)
     if dataclasses.is_dataclass(hint):
         return parse(hint, value, path)
     origin, arguments = typing.get_origin(hint), typing.get_args(hint)
@@ -81,3 +63,34 @@ def _coerce(hint, value, path: str):
     if isinstance(hint, type) and isinstance(value, hint) and (hint is bool or not isinstance(value, bool)):
         return value
     raise ValueError(f"{path}: got {value!r}, expected {getattr(hint, '__name__', hint)}.")
+
+
+def _part(kinds: Mapping[str, Any], value: Any, path: str):
+    """A part from {"kind": ..., its settings}."""
+    if not isinstance(value, dict) or "kind" not in value:
+        raise ValueError(f"{path}: got {value!r}, expected {{\"kind\": ...}} of {', '.join(kinds)}, and its settings.")
+    check_choice(f"{path}.kind", value["kind"], tuple(kinds))
+    fields = {name: item for name, item in value.items() if name != "kind"}
+    for name in fields:
+        check_acts(kinds, value["kind"], name, path)
+    return parse(kinds[value["kind"]], fields, path)
+
+
+def check_acts(kinds: Mapping[str, Any], kind: str | None, field: str, path: str) -> None:
+    """Refuses a setting that only parts of another kind have.
+
+    Args:
+      kinds: kind -> class of the parts that there may be.
+      kind: the one that there is, None for none.
+      field: the setting.
+      path: of the part, for messages.
+
+    Raises:
+      ValueError: saying which kind has it.
+    """
+    having = [name for name, cls in kinds.items() if field in {item.name for item in dataclasses.fields(cls)}]
+    if having and kind not in having:
+        part = path.removeprefix("config.")
+        raise ValueError(f"{part}.{field} is a setting of {part}={' or '.join(having)} "
+                         f"({', '.join(kinds[name].__name__ for name in having)}), and {part} is {kind or 'none'}: it "
+                         f"would do nothing. Leave it out, or choose {part}={having[0]}.")

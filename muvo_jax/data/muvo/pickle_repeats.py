@@ -1,0 +1,92 @@
+"""Items of a pickled list that differ in nothing but one payload, read all at once.
+
+A column of a data frame holds thousands of arrays or strings, one a frame. Each is some twenty opcodes, and the same
+ones as of the item before: where the bytes around the payload are equal, so is what they would do, and NumPy takes the
+payloads out of the file together.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from muvo_jax.data.muvo import pickle_standins as standins
+
+LONGEST_BYTES = 1 << 14  # of an item
+_BINGET, _LONG_BINGET = b"hj"  # opcodes
+_FIRST_LOOK = 16  # items; what fits is looked at eight times as far
+
+
+class Payload(NamedTuple):
+    """The content of one opcode: `start` to `stop` in the file, of text or of bytes."""
+
+    start: int
+    stop: int
+    is_text: bool
+
+
+class Template(NamedTuple):
+    """An item, of which others may be copies.
+
+    Attributes:
+      size: its bytes.
+      head, tail: those before and behind the payload; all of them are the head where there is none.
+      value: what it made.
+      is_text: whether its payload is one.
+      memos: how many entries of the memo it made.
+    """
+
+    size: int
+    head: bytes
+    tail: bytes
+    value: Any
+    is_text: bool
+    memos: int
+
+    @classmethod
+    def of(cls, content: bytes, start: int, stop: int, value: Any, payloads: Iterable[Payload],
+           memos: int) -> Template | None:
+        """Of the item that the bytes from `start` to `stop` made; None where copies of it are not understood."""
+        size = stop - start
+        if (content[start] == _BINGET and size == 2) or (content[start] == _LONG_BINGET and size == 5):  # made before
+            return cls(size, content[start:stop], b"", value, False, 0)
+        if isinstance(value, str):
+            is_text, made_of = True, value.encode("utf-8", "surrogatepass")
+        elif isinstance(value, standins.Array) and isinstance(value.values, np.ndarray) and value.values.ndim:
+            is_text, made_of = False, value.values.tobytes()
+        else:
+            return None
+        places = [one for one in payloads
+                  if one.start >= start and one.is_text == is_text and content[one.start:one.stop] == made_of]
+        if not places or not made_of:  # its content was made before; a copy is one to the last byte
+            return cls(size, content[start:stop], b"", value, is_text, memos)
+        payload = places[-1]
+        return cls(size, content[start:payload.start], content[payload.stop:stop], value, is_text, memos)
+
+    def copies(self, content: bytes, start: int) -> standins.Repeats | None:
+        """Those that stand in the file from `start` on; None where there is none."""
+        if not content.startswith(self.head, start):
+            return None
+        rows = np.frombuffer(content, np.uint8, (len(content) - start) // self.size * self.size, start)
+        rows = rows.reshape(-1, self.size)
+        first, last = len(self.head), self.size - len(self.tail)
+        head, tail = (np.frombuffer(part, np.uint8) for part in (self.head, self.tail))
+        count, look = 0, _FIRST_LOOK
+        while True:
+            part = rows[count:count + look]
+            fits = (part[:, :first] == head).all(1) & (part[:, last:] == tail).all(1)
+            if not fits.all() or not len(part):
+                count += int(fits.argmin()) if len(part) else 0
+                break
+            count, look = count + len(part), 8 * look
+        if not count:
+            return None
+        if first == self.size:
+            return standins.Repeats([self.value] * count)
+        payloads = np.ascontiguousarray(rows[:count, first:last])
+        if self.is_text:
+            return standins.Repeats([str(payload, "utf-8", "surrogatepass") for payload in payloads])
+        array = self.value.values
+        return standins.Repeats(payloads.view(array.dtype).reshape(count, *array.shape))

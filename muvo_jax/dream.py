@@ -19,7 +19,7 @@ with late.imports():
     from muvo_jax import evaluate, types
     from muvo_jax.data import pipeline, schema, windows
     from muvo_jax.data import prepare as prepare_lib
-    from muvo_jax.metrics import protocol, warp
+    from muvo_jax.metrics import baselines, protocol, warp
     from muvo_jax.model import rollout, world_model
     from muvo_jax.training import screen
     from muvo_jax.viz import sheets
@@ -127,7 +127,7 @@ def moved_views(batch: types.Batch, config: config_lib.Config) -> dict[str, list
     if warp.motion_source(batch, config) is None:
         return {}
     frames = warp.warp(batch[:1], context, horizon, config)
-    if any(getattr(batch, head) is not None and head not in frames for head in protocol.HEADS):
+    if not frames.keys() >= recorded[0].keys() & set(baselines.SENSORS):
         return {}
     return {"warp-last": recorded[:context] + sheets.views_of_frames(frames, 0)}
 

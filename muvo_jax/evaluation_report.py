@@ -11,30 +11,12 @@ from typing import Any
 import numpy as np
 import rich.table
 
+from muvo_jax import head as head_lib
 from muvo_jax.data import words
 from muvo_jax.metrics import occupancy, protocol
 
-# metric -> (label, decimals, whether higher is better)
-METRICS = {
-    "psnr_db": ("PSNR (dB)", 2, True), "psnr_movers_db": ("PSNR of movers (dB)", 2, True),
-    "chamfer_m": ("Chamfer (m)", 3, False), "chamfer_above_m": ("Chamfer above the road (m)", 3, False),
-    "iou_occ_above_observed": ("IoU+ above the road", 4, True),
-    "iou_occ_above_all": ("IoU+ above the road, unknown = empty", 4, True),
-    "iou_occ_movers": ("IoU+ of movers", 4, True),
-    "iou_occ_observed": ("IoU+", 4, True), "iou_empty_observed": ("IoU-", 4, True),
-    "precision_observed": ("precision", 4, True), "recall_observed": ("recall", 4, True),
-    "iou_occ_all": ("IoU+, unknown = empty", 4, True), "iou_empty_all": ("IoU-, unknown = empty", 4, True),
-    "precision_all": ("precision, unknown = empty", 4, True), "recall_all": ("recall, unknown = empty", 4, True),
-    "depth_error_m": ("depth error (m)", 2, False), "semantic_image_share": ("semantic image, share right", 4, True),
-    "semantic_range_view_share": ("semantic range view, share right", 4, True),
-    "birds_eye_share": ("bird's-eye view, share right", 4, True),
-}
 SOURCES = {"model": "model", "copy_last": "copy-last", "warp_last": "warp-last", "warp_fused": "warp-fused",
            "training_mean": "training mean"}
-HEADS = {"image": "image", "range_view": "range", "occupancy": "voxels above the road"}
-SCREEN_METRICS = ("psnr_db", "chamfer_m", "chamfer_above_m", "iou_occ_above_observed", "iou_occ_movers",
-                  "iou_occ_observed", "iou_occ_all", "depth_error_m", "semantic_image_share", "birds_eye_share")
-STEP_METRICS = ("psnr_db", "chamfer_m", "iou_occ_above_observed", "iou_occ_observed", "iou_occ_all", "iou_occ_movers")
 
 
 def screen_table(split: str, phase: str, scores: Mapping[str, Any]) -> rich.table.Table:
@@ -49,10 +31,10 @@ def screen_table(split: str, phase: str, scores: Mapping[str, Any]) -> rich.tabl
     for source in phase_scores:
         table.add_column(SOURCES[source], justify="right")
     table.add_column("model, 95 %", justify="right")
-    for name in SCREEN_METRICS:
-        if name not in phase_scores["model"]:
+    for name, metric in _labelled(phase_scores["model"]):
+        if not metric.on_screen:
             continue
-        label, decimals, higher = METRICS[name]
+        decimals, higher = metric.decimals, metric.higher
         shown = [source for source in phase_scores if name in phase_scores[source]]
         means = {source: phase_scores[source][name]["mean"] for source in shown}
         cells = marked(means, phase_scores, decimals, higher, "[bold]{}[/bold]")
@@ -60,8 +42,17 @@ def screen_table(split: str, phase: str, scores: Mapping[str, Any]) -> rich.tabl
             last = {source: phase_scores[source][name]["per_step"][-1] for source in shown}
             ends = marked(last, phase_scores, decimals, higher, "[bold]{}[/bold]")
             cells = [f"{cell} ({end})" if cell else "" for cell, end in zip(cells, ends, strict=True)]
-        table.add_row(label, *cells, interval_text(phase_scores["model"][name], decimals))
+        table.add_row(_title(metric), *cells, interval_text(phase_scores["model"][name], decimals))
     return table
+
+
+def _labelled(scores: Mapping[str, Any]) -> list[tuple[str, head_lib.Metric]]:
+    """The metrics among these scores that people read, in the order of the report."""
+    return [(name, metric) for name, metric in head_lib.metrics().items() if metric.label and name in scores]
+
+
+def _title(metric: head_lib.Metric) -> str:
+    return f"{metric.label} ({metric.unit})" if metric.unit else metric.label
 
 
 def counts_text(scores: Mapping[str, Any]) -> str:
@@ -93,8 +84,12 @@ def interval_text(metric: Mapping[str, Any], decimals: int) -> str:
 
 def answers_line(ratios: Mapping[str, Any]) -> str:
     """The action shuffle ratios of the heads for the screen."""
-    shown = ", ".join(f"{HEADS[head]} {number(ratio['mean'], 2)}" for head, ratio in ratios.items())
+    shown = ", ".join(f"{_error_name(head)} {number(ratio['mean'], 2)}" for head, ratio in ratios.items())
     return f"error under another window's actions over error under the recorded ones (1 is deaf): {shown or 'none'}"
+
+
+def _error_name(head: str) -> str:
+    return head_lib.shown((head,))[head].error_name
 
 
 def write_report(folder: pathlib.Path, report: Mapping[str, Any], suffix: str = "") -> tuple[pathlib.Path, ...]:
@@ -138,9 +133,8 @@ def markdown(report: Mapping[str, Any]) -> str:
 def _average_table(phase_scores: Mapping[str, Any]) -> list[str]:
     lines = ["| metric | " + " | ".join(SOURCES[source] for source in phase_scores) + " | frames (undefined) |",
              "|---|" + "---:|" * (len(phase_scores) + 1)]
-    for name, (label, decimals, higher) in METRICS.items():
-        if name not in phase_scores["model"]:
-            continue
+    for name, metric in _labelled(phase_scores["model"]):
+        decimals, higher = metric.decimals, metric.higher
         means = {source: metrics[name]["mean"] for source, metrics in phase_scores.items() if name in metrics}
         counted = [f"{metrics[name]['frames']} ({metrics[name]['undefined']})" for metrics in phase_scores.values()
                    if "frames" in metrics.get(name, {})]
@@ -148,7 +142,7 @@ def _average_table(phase_scores: Mapping[str, Any]) -> list[str]:
         intervals = [interval_text(metrics[name], decimals) if name in metrics else ""
                      for metrics in phase_scores.values()]
         cells = [f"{cell} [{interval}]" if interval else cell for cell, interval in zip(cells, intervals, strict=True)]
-        lines.append(f"| {label} | " + " | ".join(cells) + f" | {', '.join(counted)} |")
+        lines.append(f"| {_title(metric)} | " + " | ".join(cells) + f" | {', '.join(counted)} |")
     return lines
 
 
@@ -156,12 +150,11 @@ def _step_table(phase_scores: Mapping[str, Any]) -> list[str]:
     steps = len(next(iter(phase_scores["model"].values()))["per_step"])
     lines = ["| metric | source | " + " | ".join(str(step + 1) for step in range(steps)) + " |",
              "|---|---|" + "---:|" * steps]
-    for name in STEP_METRICS:
+    for name, metric in _labelled(phase_scores["model"]):
         for source, metrics in phase_scores.items():
-            if name in metrics:
-                label, decimals, _ = METRICS[name]
-                cells = " | ".join(number(value, decimals) for value in metrics[name]["per_step"])
-                lines.append(f"| {label} | {SOURCES[source]} | {cells} |")
+            if metric.by_step and name in metrics:
+                cells = " | ".join(number(value, metric.decimals) for value in metrics[name]["per_step"])
+                lines.append(f"| {_title(metric)} | {SOURCES[source]} | {cells} |")
     return lines
 
 
@@ -175,5 +168,5 @@ def _answer_table(ratios: Mapping[str, Any]) -> list[str]:
         interval = interval_text(ratio, 2)
         mean = number(ratio["mean"], 2) + (f" [{interval}]" if interval else "")
         cells = [mean, *(number(value, 2) for value in ratio["per_step"])]
-        lines.append(f"| {HEADS[head]} | " + " | ".join(cells) + " |")
+        lines.append(f"| {_error_name(head)} | " + " | ".join(cells) + " |")
     return lines

@@ -25,7 +25,7 @@ with late.imports():
     from muvo_jax import run as run_lib
     from muvo_jax.agents import closed_loop, environment, planners, rewards, sensitivity
     from muvo_jax.data import prepare, words
-    from muvo_jax.metrics import protocol, warp
+    from muvo_jax.metrics import baselines, protocol, warp
     from muvo_jax.model import rollout
     from muvo_jax.town import record, settings, simulator
     from muvo_jax.training import checkpoint_meta, screen
@@ -208,7 +208,7 @@ def moved_views(town: simulator.Town, config: config_lib.Config, states: Sequenc
     calibration = {name: np.stack([getattr(town.renderer, name)] * count) for name in ("intrinsics", "camera_to_ego")}
     held = np.broadcast_to(np.asarray(action, np.float32), (count, 1 + steps, 2))
     batch = types.Batch(action=held, is_first=np.zeros(held.shape[:2], bool), speed_mps=now("ego_motion")[..., 3],
-                        **{head: now(head) for head in protocol.HEADS}, **calibration)
+                        **{head: now(head) for head in baselines.SENSORS}, **calibration)
     frames = warp.warp(batch, 1, steps, config)
     range_m = frames["range_view"][..., 3]
     return {"image": frames["image"], "range_view": np.where(range_m > 0.0, range_m, now("range_view")[..., 3]),
@@ -219,7 +219,7 @@ def film(loaded: run_lib.Run, town: simulator.Town, drive: closed_loop.Drive,
          options: Options) -> list[np.ndarray]:
     """Frames of a planned drive: the town, what the model makes of it, what it expects at the end of its plan."""
     model, variables, key = loaded.model, loaded.variables, jax.random.key(options.seed)
-    heads = tuple(head for head in protocol.HEADS if head in model.config.heads)
+    heads = tuple(head for head in baselines.SENSORS if head in model.config.heads)
     states, memory, plans = closed_loop.latents(drive.moments)
     dreamt = rollout.imagine(model, variables, key, states, plans, sampled=False)
     views = []
@@ -231,7 +231,7 @@ def film(loaded: run_lib.Run, town: simulator.Town, drive: closed_loop.Drive,
     pictures = []
     for index, moment in enumerate(drive.moments):
         seen = town.render(moment.state)
-        truth = sheets.View(seen["image"], seen["range_view"], town.occupancy(seen))
+        truth = sheets.View(image=seen["image"], range_view=seen["range_view"], occupancy=town.occupancy(seen))
         columns = [("town", truth), ("world model, now", views[0][index]),
                    (f"imagined under the plan, in {options.horizon * scene.frame_s:.1f} s", views[1][index])]
         caption = (f"{index * scene.frame_s:4.1f} s   {3.6 * float(moment.state.speed_mps):3.0f} km/h   "

@@ -251,13 +251,13 @@ def _heads(options: Options, heads: Sequence[str]) -> tuple[str, ...] | None:
                    for text in (options.heads, options.with_heads))
     for flag, names in (("--heads", exact), ("--with-heads", more)):
         for name in names:
-            config_lib.check_choice(flag, name, config_lib.ALL_HEADS)
+            config_lib.check_choice(flag, name, tuple(config_lib.KNOWN_HEADS))
     if options.no_occupancy and (options.occupancy or "occupancy" in exact + more):
         raise ValueError("--no-occupancy and --occupancy (or --heads and --with-heads with occupancy) contradict each "
                          "other: give one of them.")
     wanted = {*(exact or heads), *more} | ({"occupancy"} if options.occupancy else set())
     wanted -= {"occupancy"} if options.no_occupancy else set()
-    return tuple(head for head in config_lib.ALL_HEADS if head in wanted)
+    return tuple(head for head in config_lib.KNOWN_HEADS if head in wanted)
 
 
 def default_name(options: Options) -> str:
@@ -277,7 +277,7 @@ def train(options: Options, show: screen.Screen) -> None:
     config, chosen, folder = configure(options)
     elsewhere = [f"--runs-dir={options.runs_dir}"] if options.runs_dir != pathlib.Path("runs") else []
     resume_command = shlex.join(["python", "-m", "muvo_jax.train", f"--name={folder.name}", "--resume", *elsewhere])
-    visible = not set(protocol.HEADS).isdisjoint(config.model.heads)
+    visible = bool(protocol.shown_heads(config.model))
     outcome = loop.train(loop.Job(
         config=config, folder=folder, open_recording=lambda: command_line.open_data(config, show), chosen=tuple(chosen),
         resume=options.resume, resume_command=resume_command, started_s=command_line.process_start_s(),
@@ -285,7 +285,7 @@ def train(options: Options, show: screen.Screen) -> None:
         preview=draw_preview if visible else None), show)
     draw_curves(folder)
     if not visible:
-        show.line(f"no head of {', '.join(protocol.HEADS)}: there is nothing to draw or to judge.")
+        show.line("no head shows anything: there is nothing to draw or to judge.")
     if outcome.stopped or not options.evaluate or not visible:
         return
     evaluate.evaluate(evaluate.Options(run=folder), show)

@@ -10,7 +10,7 @@ import pytest
 import muvo_jax
 
 PACKAGE = pathlib.Path(muvo_jax.__file__).parent
-BASE = {"types", "config", "geometry", "limits", "ops"}
+BASE = {"types", "config", "geometry", "limits", "ops", "head"}
 ALLOWED = {
     "types": set(),
     "limits": set(),
@@ -19,10 +19,12 @@ ALLOWED = {
     "config": {"geometry", "limits"},
     "presets": {"config"},
     "ops": {"types", "config", "geometry"},
+    "head": {"types", "config"},
     "nn": BASE,
     "model": BASE | {"nn"},
     "objectives": BASE | {"nn", "model"},
     "metrics": BASE | {"nn", "model"},
+    "heads": BASE | {"nn", "model", "objectives", "metrics", "viz"},  # imported by none: found by name
     "run": {"types", "config", "model"},
     "agents": BASE | {"nn", "model", "metrics", "run"},
     "data": BASE,

@@ -13,16 +13,7 @@ heads.py, contract.py, training.py and augmentation.py have the other sections.
 
 from muvo_jax.config.augmentation import AugmentationConfig
 from muvo_jax.config.contract import RATE_HZ, ActionContract, Kinematics
-from muvo_jax.config.heads import (
-    ALL_HEADS,
-    BIRDS_EYE_CLASSES,
-    EGO_MOTION_UNITS,
-    HEADS,
-    TARGETS,
-    TERM_TARGETS,
-    LossConfig,
-    head_targets,
-)
+from muvo_jax.config.heads import BIRDS_EYE_CLASSES, HEADS, KNOWN_HEADS, LossConfig
 from muvo_jax.config.model import BACKBONES, ModelConfig
 from muvo_jax.config.parsing import check_choice, parse
 from muvo_jax.config.parts import (
@@ -51,10 +42,10 @@ from muvo_jax.config.training import DataConfig, EvaluationConfig, OptimizerConf
 from muvo_jax.config.whole import Config
 from muvo_jax.geometry import BirdsEyeGrid, PillarGrid, RangeViewGeometry, RouteMap, VoxelGrid
 
-__all__ = ["ALL_HEADS", "BACKBONES", "BIRDS_EYE_CLASSES", "CAMERAS", "EGO_MOTION_UNITS", "FLOW_LAGS", "FUSIONS",
-           "HEADS", "LATENTS", "LIDARS", "NO_SENSOR", "RATE_HZ", "TARGETS", "TERM_TARGETS", "ActionContract",
+__all__ = ["BACKBONES", "BIRDS_EYE_CLASSES", "CAMERAS", "FLOW_LAGS", "FUSIONS",
+           "HEADS", "KNOWN_HEADS", "LATENTS", "LIDARS", "NO_SENSOR", "RATE_HZ", "ActionContract",
            "AugmentationConfig", "AverageFusion", "BirdsEyeCamera", "BirdsEyeGrid", "ConcatenationFusion", "Config",
            "DataConfig", "EvaluationConfig", "Kinematics", "LastSeen", "LossConfig", "ModelConfig", "OptimizerConfig",
            "PillarGrid", "PillarLidar", "PlaneCamera", "RangeViewGeometry", "RangeViewLidar", "RouteMap",
            "TokenLatent", "TrainConfig", "TrainingMean", "TransformerFusion", "VectorLatent", "VoxelGrid",
-           "ZeroGuess", "as_kind", "check_choice", "head_targets", "override", "override_all", "parse"]
+           "ZeroGuess", "as_kind", "check_choice", "override", "override_all", "parse"]

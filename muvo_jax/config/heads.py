@@ -1,64 +1,33 @@
-"""What a model decodes: its heads by name, the recorded truth that each is compared with, the weights of the terms.
-
-A new head is one row in each of four places, all by the same name, and nothing else:
-
-1. TARGETS below: the Batch fields that its loss reads, each with its shape for one frame. A field that no recording had
-   so far also needs a line in types.Batch, types.BATCH_FIELDS, data/schema.RawFrame and the table data/fields.py, which
-   tells the plain format's reader and writer how it is stored.
-2. model/heads.TABLE: its decoder (`_vector` for a number or a few of them).
-3. objectives/terms.TABLE: its loss terms, each with the field of LossConfig that weighs it.
-4. LossConfig below: these weights.
-
-Then --with-heads=NAME trains it, a recording without its fields is refused by name, and `decode` returns it. A term
-that may be off and reads fields of its own has a row in TERM_TARGETS too.
-"""
+"""Which heads there are, and the weights of their loss terms."""
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Mapping
-from typing import Annotated, Any, Literal, NamedTuple
+from typing import Annotated, Literal
 
 from muvo_jax.limits import COUNT, NOT_NEGATIVE, SHARE, above, at_least, check
 
+# Head -> "module:name" of the muvo_jax.head.Head that is all of it. A new head is a line here and the file it names.
+KNOWN_HEADS = {
+    "image": "muvo_jax.heads.image:HEAD",
+    "range_view": "muvo_jax.heads.range_view:HEAD",
+    "occupancy": "muvo_jax.heads.occupancy:HEAD",
+    "action": "muvo_jax.heads.action:HEAD",
+    "depth": "muvo_jax.heads.maps:DEPTH",
+    "semantic_image": "muvo_jax.heads.maps:SEMANTIC_IMAGE",
+    "semantic_range_view": "muvo_jax.heads.maps:SEMANTIC_RANGE_VIEW",
+    "birds_eye": "muvo_jax.heads.birds_eye:HEAD",
+    "reward": "muvo_jax.heads.numbers:REWARD",
+    "continue": "muvo_jax.heads.numbers:CONTINUE",
+    "ego_motion": "muvo_jax.heads.numbers:EGO_MOTION",
+}
 HEADS = ("image", "range_view", "occupancy", "action")  # of the paper; the others are optional
 BIRDS_EYE_CLASSES = 8
-EGO_MOTION_UNITS = (1.0, 0.1, 0.05, 5.0)  # m forward, m left, rad, m/s: about what a step of 0.2 s brings
-Shapes = Mapping[str, tuple[int, ...]]
-
-# Head -> what a ModelConfig makes of it: Batch field -> its shape for one frame.
-TARGETS: dict[str, Callable[[Any], Shapes]] = {
-    "image": lambda model: {"image": (*model.image_size, 3)},
-    "range_view": lambda model: {"range_view": (model.range_view.rows, model.range_view.columns, 4)},
-    "occupancy": lambda model: {"occupancy": model.voxels.shape},
-    "action": lambda model: {"action": (2,)},
-    "depth": lambda model: {"depth_m": model.image_size},
-    "semantic_image": lambda model: {"image_classes": model.image_size},
-    "semantic_range_view": lambda model: {
-        "range_view_classes": (model.range_view.rows, model.range_view.columns)},
-    "birds_eye": lambda model: {"birds_eye_classes": model.voxels.shape[:2],
-                                "birds_eye_instances": model.voxels.shape[:2]},
-    "reward": lambda model: {"reward": ()},
-    "continue": lambda model: {"is_terminal": ()},
-    "ego_motion": lambda model: {"ego_motion": (4,)},
-}
-ALL_HEADS = tuple(TARGETS)
-
-
-class TermTarget(NamedTuple):
-    """A Batch field that one term reads beside those of its head, where the field `weight` of LossConfig is not 0."""
-
-    head: str
-    weight: str
-    shape: Callable[[Any], tuple[int, ...]]
-
-
-TERM_TARGETS = {"image_instance_mask": TermTarget("image", "image_instance", lambda model: model.image_size)}
 
 
 @dataclasses.dataclass(frozen=True)
 class LossConfig:
-    """Weights of the loss terms (paper Eq. 1) at scale 1; scale f counts 1/f.
+    """Weights of the loss terms (paper Eq. 1) at scale 1; scale f counts 1/f. A head may bring weights of its own.
 
     `image` (L1), `image_squared` (L2, an addition to the paper), `range_xyz`, `range_depth` and `occupancy_*` apply per
     scale; 0 switches a term off. The Chamfer term looks at `chamfer_points` returns of each side; a predicted return is
@@ -71,7 +40,7 @@ class LossConfig:
     Of the optional heads: `depth` (L1), cross-entropies `semantic_image`, `semantic_range_view` and `birds_eye`, L2 of
     the `birds_eye_centre` map and, at the same weight at every scale, L1 of the `birds_eye_offset` in cells. The
     `*_weights` are of each class (empty: 1); of each frame only the `*_share` of the pixels predicted worst count.
-    `reward` is an L2, `continue_` a cross-entropy, `ego_motion` an L1 in EGO_MOTION_UNITS.
+    `reward` is an L2, `continue_` a cross-entropy, `ego_motion` an L1 in units of about what a step brings.
     """
 
     image: Annotated[float, NOT_NEGATIVE] = 0.1
@@ -110,10 +79,3 @@ class LossConfig:
 
     def __post_init__(self):
         check(self)
-
-
-def head_targets(head: str, model: Any, loss: LossConfig) -> dict[str, tuple[int, ...]]:
-    """Batch field -> its shape for one frame, of everything that the terms of a head read."""
-    more = {field: target.shape(model) for field, target in TERM_TARGETS.items()
-            if target.head == head and getattr(loss, target.weight)}
-    return {**TARGETS[head](model), **more}

@@ -6,7 +6,7 @@ import dataclasses
 from typing import Annotated, Literal
 
 from muvo_jax.config.contract import Kinematics
-from muvo_jax.config.heads import ALL_HEADS, HEADS
+from muvo_jax.config.heads import HEADS, KNOWN_HEADS
 from muvo_jax.config.parsing import check_choice
 from muvo_jax.config.parts import (
     NO_SENSOR,
@@ -38,7 +38,7 @@ class ModelConfig:
         or camera may be None: then the model does not see that sensor (its heads are another matter).
       numerics: "standard" follows the mathematics, "reference" the authors' code (DEVIATIONS.md lists the difference).
         Without "reference" the authors' weights give other numbers than theirs.
-      heads: what is decoded, of heads.TARGETS; a modality that the data lacks has no head.
+      heads: what is decoded, of KNOWN_HEADS; a modality that the data lacks has no head.
       semantic_classes: of the heads semantic_image and semantic_range_view, as the recording counts them. Too few, and
         the labels of the others are read as none.
       route, speed: whether the planned route and the speed are inputs. Without them the model cannot know what a driver
@@ -132,7 +132,7 @@ class ModelConfig:
         check(self)
         check_choice("model.backbone", self.backbone, BACKBONES)
         for head in self.heads:
-            check_choice("model.heads", head, ALL_HEADS)
+            check_choice("model.heads", head, tuple(KNOWN_HEADS))
         if self.lidar is None and self.camera is None:
             raise ValueError("model.lidar and model.camera are both none: a model needs one of them.")
         if any(side % 32 for side in self.image_size):

@@ -189,7 +189,7 @@ class ZeroGuess:
 
 @dataclasses.dataclass(frozen=True)
 class TrainingMean:
-    """Decoders draw the difference from the average training frame; see model/outputs.py."""
+    """Decoders draw the difference from the average training frame; see model/decoders.py."""
 
     kind: Literal["training_mean"] = dataclasses.field(default="training_mean", init=False)
 

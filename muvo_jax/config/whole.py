@@ -8,7 +8,7 @@ from typing import Any
 from muvo_jax.config import migration
 from muvo_jax.config.augmentation import AugmentationConfig
 from muvo_jax.config.contract import ActionContract, Kinematics
-from muvo_jax.config.heads import LossConfig, head_targets
+from muvo_jax.config.heads import LossConfig
 from muvo_jax.config.model import ModelConfig
 from muvo_jax.config.parsing import parse
 from muvo_jax.config.parts import LastSeen
@@ -36,12 +36,6 @@ class Config:
         if self.model.kinematics != wanted:  # one truth: contract and stride
             object.__setattr__(self, "model", dataclasses.replace(self.model, kinematics=wanted))
         self.model.check_motion()
-
-    @property
-    def targets(self) -> dict[str, tuple[int, ...]]:
-        """What the loss terms of the heads compare with: Batch field -> its shape for one frame."""
-        return {field: shape for head in self.model.heads
-                for field, shape in head_targets(head, self.model, self.loss).items()}
 
     def to_dict(self) -> dict[str, Any]:
         """Plain JSON types, and the version of their names."""

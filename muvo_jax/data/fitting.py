@@ -7,6 +7,7 @@ from collections.abc import Collection
 from typing import NamedTuple
 
 from muvo_jax import config as config_lib
+from muvo_jax import head as head_lib
 from muvo_jax.data import prepare, schema, sequences, windows
 
 SHORT_RECORDING_FRAMES = 100
@@ -56,10 +57,11 @@ def adapt(config: config_lib.Config, recording: schema.Recording, *, keep: Colle
 def check_targets(config: config_lib.Config, description: schema.RecordingDescription) -> None:
     """Raises DataError where a head or term cannot be trained: names it, what the recording lacks, and the way out."""
     for head in config.model.heads:
-        fields = config_lib.head_targets(head, config.model, config.loss)
+        described = head_lib.get(head)
+        fields = described.learns_from(config.model, config.loss)
         for field in sorted(prepare.recorded(fields) - description.modalities):
-            if field in config_lib.TERM_TARGETS:
-                weight = config_lib.TERM_TARGETS[field].weight
+            if field in described.term_targets:
+                weight = described.term_targets[field].weight
                 raise schema.DataError(f"loss.{weight} is on and learns from {field}, which recording "
                                        f"{description.name!r} does not hold. Leave the term out (--set "
                                        f"loss.{weight}=0), or record what it takes (docs/variants.md).")

@@ -13,6 +13,7 @@ from collections.abc import Collection
 import numpy as np
 
 from muvo_jax import config as config_lib
+from muvo_jax import head as head_lib
 from muvo_jax.data import schema
 from muvo_jax.ops import camera as camera_ops
 from muvo_jax.ops import range_view as range_view_ops
@@ -43,20 +44,20 @@ def prepare_frame(raw: schema.RawFrame, config: config_lib.Config) -> PreparedFr
     Raises:
       DataError: where the frame does not fit the config, naming frame and field.
     """
-    model = config.model
+    model, targets = config.model, head_lib.targets(config)
     lacking = sorted(needed(config, raw.keys()) - raw.keys())
     if lacking:
         raise schema.DataError(f"frame {int(raw['frame_id'])} has no {', '.join(lacking)}, which the model needs. "
                                f"Choose windows of sequences that have it (schema.Sequence.has).")
     ready: PreparedFrame = {name: raw[name] for name in ("action", "timestamp_s", "frame_id")}
     try:
-        if model.camera is not None or "image" in config.targets:
+        if model.camera is not None or "image" in targets:
             ready["image"], ready["intrinsics"] = camera_ops.resize_crop(raw["image"], raw["intrinsics"],
                                                                          model.image_size)
             ready["camera_to_ego"] = raw["camera_to_ego"]
-        if model.lidar is not None or "range_view" in config.targets:
+        if model.lidar is not None or "range_view" in targets:
             ready["range_view"] = range_view_ops.project(raw["points_m"], model.range_view)
-        if "occupancy" in model.heads:
+        if "occupancy" in targets:
             ready["occupancy"] = _occupancy(raw, model)
     except ValueError as error:
         raise schema.DataError(f"frame {int(raw['frame_id'])}: {error}") from error
@@ -69,7 +70,7 @@ def prepare_frame(raw: schema.RawFrame, config: config_lib.Config) -> PreparedFr
         ready["route_map"] = raw["route_map"]
     if "speed_mps" in raw:
         ready["speed_mps"] = raw["speed_mps"]
-    for name in ("reward", "is_terminal", *(config.targets.keys() - _ALWAYS_THERE - _MADE_OF.keys())):
+    for name in ("reward", "is_terminal", *(targets.keys() - _ALWAYS_THERE - _MADE_OF.keys())):
         if name in raw:
             ready[name] = raw[name]  # type: ignore[literal-required]
     if "pose" in raw and "speed_mps" in raw:  # still in the frame of the run: motion begins with a second frame
@@ -79,7 +80,7 @@ def prepare_frame(raw: schema.RawFrame, config: config_lib.Config) -> PreparedFr
 
 def judged_only(config: config_lib.Config) -> frozenset[str]:
     """The fields of a prepared frame that scores read and training does not, as far as a recording has them."""
-    return _JUDGED - config.targets.keys()
+    return _JUDGED - head_lib.targets(config).keys()
 
 
 def _moving(raw: schema.RawFrame, ready: PreparedFrame, config: config_lib.Config) -> PreparedFrame:
@@ -95,7 +96,7 @@ def _moving(raw: schema.RawFrame, ready: PreparedFrame, config: config_lib.Confi
 def _labels(raw: schema.RawFrame, config: config_lib.Config) -> PreparedFrame:
     """Targets that must be brought to the model's sizes, as far as the frame has them."""
     ready: PreparedFrame = {}
-    model, targets = config.model, config.targets
+    model, targets = config.model, head_lib.targets(config)
     if "depth_m" in raw and "depth_m" in targets:
         depth_m = camera_ops.resize_crop_nearest(raw["depth_m"], model.image_size)
         ready["depth_m"] = np.where(depth_m < DEPTH_LIMIT_M, depth_m, range_view_ops.NO_RETURN_M).astype(np.float32)
@@ -111,13 +112,13 @@ def _labels(raw: schema.RawFrame, config: config_lib.Config) -> PreparedFrame:
 
 def needed(config: config_lib.Config, modalities: Collection[str]) -> frozenset[str]:
     """The keys of RawFrame that `prepare_frame` must find, of a recording with these modalities."""
-    model, targets = config.model, config.targets
+    model, targets = config.model, head_lib.targets(config)
     names = {"action", "timestamp_s", "frame_id"} | (recorded(targets) - _OPTIONAL)
     if model.camera is not None or "image" in targets:
         names |= {"image", "intrinsics", "camera_to_ego"}
     if model.lidar is not None or "range_view" in targets:
         names.add("points_m")
-    if "occupancy" in model.heads:
+    if "occupancy" in targets:
         names.add("occupancy" if "occupancy" in modalities else "points_m")
     names |= set(NAVIGATION) if model.navigation else set()
     speed = model.speed or (model.tracks_motion and model.kinematics is not None)
@@ -127,7 +128,7 @@ def needed(config: config_lib.Config, modalities: Collection[str]) -> frozenset[
 
 def labels(config: config_lib.Config) -> frozenset[str]:
     """Which of schema.LABELS the heads of a model learn from."""
-    return schema.LABELS & recorded(config.targets)
+    return schema.LABELS & recorded(head_lib.targets(config))
 
 
 def recorded(targets: Collection[str]) -> frozenset[str]:

@@ -11,31 +11,17 @@ from typing import Any
 import numpy as np
 
 from muvo_jax import config as config_lib
+from muvo_jax import head as head_lib
 from muvo_jax import types
-from muvo_jax.metrics import occupancy, streaming
+from muvo_jax.metrics import streaming
 
 
 def errors(prediction: Mapping[str, np.ndarray], truth: types.Batch,
            grid: config_lib.VoxelGrid) -> dict[str, np.ndarray]:
-    """Head -> error of each frame, float64 [B, H].
-
-    Squared error of the image; absolute error of the range where the recording has a return, m; of the known voxels
-    above the road how many are decided wrongly.
-    """
-    found: dict[str, np.ndarray] = {}
-    if "image" in prediction and truth.image is not None:
-        target = np.asarray(truth.image, np.float32) / 255.0
-        found["image"] = np.square(prediction["image"] - target).mean(axis=(2, 3, 4), dtype=np.float64)
-    if "range_view" in prediction and truth.range_view is not None:
-        target = np.asarray(truth.range_view)[..., 3]
-        gap_m = np.abs(np.asarray(prediction["range_view"])[..., 3] - target)
-        found["range_view"] = np.where(target > 0.0, gap_m, 0.0).sum(axis=(2, 3), dtype=np.float64)
-    if "occupancy" in prediction and truth.occupancy is not None:
-        above = occupancy.above_road(grid)
-        counted = occupancy.counts(prediction["occupancy"][..., above], np.asarray(truth.occupancy)[..., above],
-                                   unknown_is_empty=False)
-        found["occupancy"] = counted["false_positive"] + counted["false_negative"]
-    return found
+    """Head -> error of each frame, float64 [B, H], of the heads that say what theirs is (head.Frames.error)."""
+    return {name: frames.error(np.asarray(prediction[name]), truth, grid)
+            for name, frames in head_lib.shown(tuple(prediction)).items()
+            if frames.error is not None and getattr(truth, frames.field) is not None}
 
 
 class Answers:

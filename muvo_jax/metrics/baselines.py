@@ -11,10 +11,11 @@ import jax
 import numpy as np
 
 from muvo_jax import types
+from muvo_jax.head import SCALES
 from muvo_jax.ops import resample
 
 Frames = dict[str, np.ndarray]
-COARSE_SCALES = (2, 4)
+SENSORS = ("image", "range_view", "occupancy")  # what baselines predict
 
 
 def copy_last(batch: types.Batch, context: int, horizon: int) -> tuple[Frames, int]:
@@ -32,8 +33,7 @@ def copy_last(batch: types.Batch, context: int, horizon: int) -> tuple[Frames, i
       [...]}, as read-only views without the modalities that the batch lacks, and the number of voxels copied from
       unknown (of one frame per window).
     """
-    last = {name: np.asarray(getattr(batch, name)[:, context - 1]) for name in ("image", "range_view", "occupancy")
-            if getattr(batch, name) is not None}
+    last = {name: np.asarray(value[:, context - 1]) for name in SENSORS if (value := getattr(batch, name)) is not None}
     unknown = 0
     if "image" in last:
         last["image"] = last["image"].astype(np.float32) / 255.0
@@ -79,7 +79,7 @@ class TrainingMean:
             sums["returned"] = returned.sum(axis=(0, 1), dtype=np.int64)
         if batch.occupancy is not None:
             coarse = {1: np.asarray(batch.occupancy)}
-            for scale in COARSE_SCALES:
+            for scale in SCALES[1:]:
                 if any(side % 2 for side in coarse[scale // 2].shape[2:]):
                     break  # no decoder has such scales
                 coarse[scale] = resample.pool_occupancy(coarse[scale // 2])

@@ -16,13 +16,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from muvo_jax import config as config_lib
+from muvo_jax import head as head_lib
 from muvo_jax import types
-from muvo_jax.metrics import answers, baselines, maps, occupancy, tally, warp
+from muvo_jax.metrics import answers, baselines, tally, warp
 from muvo_jax.model import rollout, world_model
 
 VERSION = "muvo_jax-2"
 PHASES = ("observed", "imagined")
-HEADS = tally.HEADS
 # What is judged, in the order of tables.
 SOURCES = ("model", "copy_last", "warp_last", "warp_fused", "training_mean")
 _MOTION = {"bicycle": "motion from actions", "none": "motion as recorded"}
@@ -67,7 +67,8 @@ def predict(model: world_model.WorldModel, variables: types.Variables, key: type
 
     Returns:
       {"image": float32 [B, context + horizon, H, W, 3] in [0, 1], "range_view": float32 [...] in metres, "occupancy":
-      bool [B, context + horizon, X, Y, Z]}, for the heads that the model has; of optional heads see maps.finish.
+      bool [B, context + horizon, X, Y, Z]}, for the heads that the model has; of optional heads as types.Batch holds
+      what they predict.
     """
     return jax.device_get(_predict(model, variables, key, batch, None, context, horizon, sampled)[0])
 
@@ -83,8 +84,7 @@ def _predict(model, variables, key, batch, other_action, context, horizon, sampl
                             same_noise=True)
     states = jax.tree.map(lambda seen, dreamt: jnp.concatenate([seen, *jnp.unstack(dreamt, axis=1)], axis=1),
                           observed.states, dream.states)
-    heads = shown_heads(model.config)
-    frames = finish(model.decode(variables, states, heads, observed.memory), model.config)
+    frames = finish(model.decode(variables, states, shown_heads(model.config), observed.memory), model.config)
     end = context + horizon
     return ({name: value[:, :end] for name, value in frames.items()},
             None if other_action is None else {name: value[:, end:] for name, value in frames.items()})
@@ -92,21 +92,13 @@ def _predict(model, variables, key, batch, other_action, context, horizon, sampl
 
 def shown_heads(config: config_lib.ModelConfig) -> tuple[str, ...]:
     """The heads of a model whose frames are scored and drawn."""
-    return tuple(head for head in (*HEADS, *maps.FIELDS) if head in config.heads)
+    return tuple(head_lib.shown(config.heads))
 
 
 def finish(predictions: types.Predictions, model: config_lib.ModelConfig) -> dict[str, types.Array]:
-    """Full-scale predictions as frames: the image clipped to [0, 1], occupancy decided as the model says.
-
-    What optional heads draw stands under the names of types.Batch (maps.finish).
-    """
-    frames = {head: predictions[head] for head in predictions if head not in maps.FIELDS}
-    frames |= maps.finish({head: predictions[head] for head in predictions if head in maps.FIELDS})
-    if "image" in frames:
-        frames["image"] = jax.numpy.clip(frames["image"], 0.0, 1.0)
-    if "occupancy" in frames:
-        frames["occupancy"] = occupancy.predicted_occupied(frames["occupancy"], model.occupied_above)
-    return frames
+    """Full-scale predictions of shown heads as frames (head.Frames.of): the image clipped to [0, 1], occupancy decided
+    as the model says, classes instead of logits."""
+    return {name: frames.of(predictions[name], model) for name, frames in head_lib.shown(predictions.heads).items()}
 
 
 def evaluate(model: world_model.WorldModel | None, variables: types.Variables | None, windows: Iterable[Windows],

@@ -12,9 +12,9 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
+from muvo_jax import head as head_lib
+
 REFERENCES = ("warp_last", "copy_last")  # the first that was judged
-_ERRORS = {"psnr_db": lambda decibels: 10.0 ** (-decibels / 10.0), "chamfer_m": lambda metres: metres,
-           "iou_occ_above_observed": lambda share: 1.0 - share}
 STATED = ("mean over the validation splits of 1 - error / error of the moved last frame, over image, points and voxels "
           "above the road, of imagined frames")
 
@@ -29,9 +29,11 @@ def skill(imagined: Mapping[str, Mapping[str, Any]]) -> float:
     if reference is None:
         return math.nan
     found = []
-    for metric, error in _ERRORS.items():
-        pair = [imagined[source].get(metric, {}).get("mean", math.nan) for source in ("model", reference)]
-        ours, theirs = map(error, pair)
+    for name, metric in head_lib.metrics().items():
+        if metric.error is None:
+            continue
+        pair = [imagined[source].get(name, {}).get("mean", math.nan) for source in ("model", reference)]
+        ours, theirs = map(metric.error, pair)
         if math.isfinite(ours) and math.isfinite(theirs) and theirs > 0.0:
             found.append(1.0 - ours / theirs)
     return sum(found) / len(found) if found else math.nan

@@ -1,6 +1,12 @@
-"""Decoders from the latent features to images, range views, voxels and actions (paper section III-D).
+"""Decoders from the latent features to images, range views, voxels and numbers (paper section III-D).
 
-Each maps features [N, F] to {scale: array}, scale 1 being the full size, 2 and 4 halved once and twice.
+Each maps features [N, F], or with the 2D latent a map of tokens [N, *grid, C], to {scale: array}, scale 1 being the
+full size, 2 and 4 halved once and twice. Those of tokens are a convolution, doublings at full width, then three with
+half, a quarter and an eighth of it, each of which ends in one scale. What heads are built of stands at the end.
+
+With first_guess=TrainingMean, an addition to the paper (docs/design.md says what it brings), a decoder draws the
+difference from the average training frame, which the training loop measures before the first step (FirstGuess): a
+fresh model predicts the average and learns the rest.
 """
 
 from __future__ import annotations
@@ -9,11 +15,15 @@ import jax
 import jax.numpy as jnp
 from flax import linen
 
+from muvo_jax import head as head_lib
+from muvo_jax.config import ModelConfig, TokenLatent, ZeroGuess
+from muvo_jax.model import common, memory, tokens
 from muvo_jax.nn import layers, norm
 from muvo_jax.ops import resample
 
 _PLANE_KERNELS = (5, 5, 6, 6, 6, 6)
 INSTANCE_CHANNELS = 3  # offset and centre
+_TOKEN_STAGES = ((4, 2), (2, 4), (1, 8))  # scale, by what the width is divided
 
 
 def plane_start(size: tuple[int, ...]) -> tuple[tuple[int, ...], tuple[int, ...]]:
@@ -123,7 +133,11 @@ class StyledDecoder(linen.Module):
 
     @linen.compact
     def __call__(self, features: jax.Array) -> dict[int, jax.Array]:
-        start = tuple(side // 2 ** (self.blocks + 3) for side in self.shape)
+        shrink = 2 ** (self.blocks + 3)
+        if any(side % shrink for side in self.shape):
+            raise ValueError(f"a decoder of {self.shape} voxels doubles {self.blocks + 3} times: each side must be a "
+                             f"multiple of {shrink}. Change model.voxels or model.latent.occupancy_blocks.")
+        start = tuple(side // shrink for side in self.shape)
         constant = self.param("constant", layers.shape_only, (*start, self.constant_width)).astype(self.compute.dtype)
         x = jnp.broadcast_to(constant[None], (features.shape[0], *constant.shape))
         x = norm.AdaptiveInstanceNorm(self.compute, name="first_norm")(x, features)
@@ -133,6 +147,55 @@ class StyledDecoder(linen.Module):
         out = {}
         for scale, width in ((4, self.width // 2), (2, self.width // 4), (1, self.width // 8)):
             x = StyledUpBlock(width, self.compute, name=f"up_{scale}")(x, features)
+            out[scale] = self.head(self.channels, self.compute, name=f"head_{scale}")(x).astype(jnp.float32)
+        return out
+
+
+class _Doubling(linen.Module):
+    """Transposed convolution of stride 2, ELU: every side doubles."""
+
+    features: int
+    kernel: int
+    compute: layers.Compute = layers.Compute()
+
+    @linen.compact
+    def __call__(self, x: jax.Array) -> jax.Array:
+        rank = x.ndim - 2
+        conv = layers.ConvTranspose(self.features, (self.kernel,) * rank, (2,) * rank, self.compute, name="conv")
+        return jax.nn.elu(conv(x))
+
+
+class TokenDecoder(linen.Module):
+    """[N, *grid, C] -> [N, *(grid * 2**(stages + 3) / scale), channels], for two or three axes; no output activation.
+
+    Attributes:
+      channels: of every output.
+      first_width: of the first convolution.
+      width: of the `stages` doublings, and what the last three divide.
+      stages: doublings before the first output.
+      head: the layer that ends each scale.
+      flat: decode the ground plan, the largest value over the last of three axes.
+    """
+
+    channels: int
+    first_width: int
+    width: int
+    stages: int
+    compute: layers.Compute = layers.Compute()
+    head: type[layers.Dense] | type[BirdsEyeHead] = layers.Dense
+    flat: bool = False
+
+    @linen.compact
+    def __call__(self, cells: jax.Array) -> dict[int, jax.Array]:
+        if self.flat:
+            cells = cells.max(axis=-2)
+        rank = cells.ndim - 2
+        x = jax.nn.elu(layers.Conv(self.first_width, (3,) * rank, self.compute, name="first")(cells))
+        for index in range(self.stages):
+            x = _Doubling(self.width, 4, self.compute, name=f"pre{index}")(x)
+        out = {}
+        for scale, divisor in _TOKEN_STAGES:
+            x = _Doubling(self.width // divisor, 6, self.compute, name=f"grow_{scale}")(x)
             out[scale] = self.head(self.channels, self.compute, name=f"head_{scale}")(x).astype(jnp.float32)
         return out
 
@@ -160,3 +223,79 @@ class VectorDecoder(linen.Module):
     def __call__(self, features: jax.Array) -> dict[int, jax.Array]:
         out = layers.Mlp((self.width, self.width, self.channels), self.compute, name="mlp")(features)
         return {1: out.astype(jnp.float32)}
+
+
+class FirstGuess(linen.Module):
+    """{scale: [N, *size, C]} -> the same plus one constant [*size, C] a scale, kept beside BatchNorm's statistics."""
+
+    @linen.compact
+    def __call__(self, outputs: dict[int, jax.Array]) -> dict[int, jax.Array]:
+        return {scale: value + self.variable("batch_stats", f"scale_{scale}", jnp.zeros, value.shape[1:]).value[None]
+                for scale, value in outputs.items()}
+
+
+def first_guess_path(head: str) -> str:
+    """Where the constants of a head lie in `batch_stats`."""
+    return f"first_guess_{head}"
+
+
+def initial_constants(config: ModelConfig) -> dict[str, float]:
+    """Path of a parameter -> its first value, for the heads whose decoders do not see the memory.
+
+    Where the average training frame is the first guess, the last layers start at zero and add nothing to it.
+    """
+    values: dict[str, float] = {}
+    guessed = memory.guessed_heads(config)
+    for name in config.heads:
+        head = head_lib.get(name)
+        if head.initial_bias is None or name in guessed:
+            continue
+        for scale in head.scales:
+            path = f"decoders_{name}/head_{scale}"
+            if not isinstance(config.first_guess, ZeroGuess) and head.average is not None:
+                values |= {f"{path}/bias": 0.0, f"{path}/kernel": 0.0}
+            else:
+                values[f"{path}/bias"] = head.initial_bias
+    return values
+
+
+def of_image(config: ModelConfig, channels: int) -> linen.Module:
+    """What draws on the image's plane."""
+    return _plane(config, channels, config.image_size, tokens.IMAGE_SHRINK)
+
+
+def of_range_view(config: ModelConfig, channels: int) -> linen.Module:
+    """What draws on the range view's plane."""
+    return _plane(config, channels, (config.range_view.rows, config.range_view.columns), tokens.RANGE_VIEW_SHRINK)
+
+
+def of_voxels(config: ModelConfig, channels: int) -> linen.Module:
+    """What fills the voxel grid."""
+    width, compute = config.occupancy_channels, common.compute(config)
+    if isinstance(config.latent, TokenLatent):
+        return TokenDecoder(channels, 2 * width, width, config.latent.occupancy_token_stages, compute)
+    return StyledDecoder(config.voxels.shape, channels, 2 * width, width, config.latent.occupancy_blocks,
+                         compute=compute)
+
+
+def of_ground_plan(config: ModelConfig, classes: int) -> linen.Module:
+    """What draws classes and instances on the ground plan of the voxel grid."""
+    width, compute, channels = config.decoder_channels, common.compute(config), classes + INSTANCE_CHANNELS
+    if isinstance(config.latent, TokenLatent):
+        return TokenDecoder(channels, width, width, config.latent.occupancy_token_stages, compute, BirdsEyeHead,
+                            flat=True)
+    return StyledDecoder(config.voxels.shape[:2], channels, width, width, config.latent.occupancy_blocks, BirdsEyeHead,
+                         compute)
+
+
+def of_numbers(config: ModelConfig, channels: int) -> linen.Module:
+    """A few numbers, without an output activation: reward, motion and the like."""
+    return VectorDecoder(channels, config.decoder_channels, common.compute(config))
+
+
+def _plane(config: ModelConfig, channels: int, size: tuple[int, int], token_shrink: int) -> linen.Module:
+    width, compute = config.decoder_channels, common.compute(config)
+    if isinstance(config.latent, TokenLatent):
+        stages = token_shrink.bit_length() - 4  # three more doublings end in an output each
+        return TokenDecoder(channels, width, width, stages, compute)
+    return PlaneDecoder(size, channels, width, compute)

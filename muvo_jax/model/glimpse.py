@@ -8,13 +8,13 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from typing import NamedTuple
 
 import flax.struct
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from muvo_jax import head as head_lib
 from muvo_jax.config import LastSeen, ModelConfig, as_kind
 from muvo_jax.geometry import VoxelGrid
 from muvo_jax.model import memory as memory_lib
@@ -84,7 +84,8 @@ class VoxelGlimpse:
 Glimpse = ImageGlimpse | RangeGlimpse | VoxelGlimpse
 
 
-class Sight(NamedTuple):
+@flax.struct.dataclass
+class Sight:
     """Which observations n vantages look at, the newest last.
 
     Attributes:
@@ -124,16 +125,17 @@ def look(config: ModelConfig, memory: Memory, rows: Array, vantage: Vantage,
     pose = motion_ops.relative(jnp.broadcast_to(vantage.motion.pose[:, None], (*index.shape, 3)),
                                memory.pose[rows[:, None], index])
     sight = Sight(rows, index, known, pose, jnp.maximum(vantage.steps, 1))
-    glimpses: dict[str, Glimpse] = {}
-    if "occupancy" in heads:
+    views, glimpses = memory_lib.views(heads), dict[str, Glimpse]()
+    if "occupancy" in views:
         glimpses["occupancy"] = _voxels(config, memory, sight)
-    if "range_view" in heads or "image" in heads:
+    if "range_view" in views or "image" in views:
         glimpses["range_view"] = view = _ranges(config, memory, sight)
-        if "image" in heads:
+        if "image" in views:
             glimpses["image"] = _image(config, memory, sight, view)
     apart = jnp.where(known[:, -1:], pose[:, -1], 0.0) / jnp.array([10.0, 2.0, 0.3], jnp.float32).reshape(1, 3)
     numbers = [apart, vantage.steps.astype(jnp.float32)[:, None] / 5.0, vantage.motion.speed_mps[:, None] / 10.0]
-    return {head: glimpses[head] for head in heads}, jnp.concatenate(numbers, axis=-1)
+    found = {name: glimpses[guide.view] for name in heads if (guide := head_lib.get(name).guide) is not None}
+    return found, jnp.concatenate(numbers, axis=-1)
 
 
 def _scans(memory: Memory, sight: Sight) -> tuple[Array, Array, Array]:
@@ -254,7 +256,8 @@ def with_evidence(config: ModelConfig, memory: Memory | None, vantage: Vantage |
     Raises:
       ValueError: if the vantage is not [B], or is concrete and not that of the newest observation.
     """
-    if memory is None or vantage is None or "occupancy" not in config.heads:
+    if memory is None or vantage is None or (
+            "occupancy" not in memory_lib.views(memory_lib.guessed_heads(config))):
         return memory
     drives, frames = memory.pose.shape[:2]
     if jnp.shape(vantage.last) != (drives,):

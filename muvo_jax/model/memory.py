@@ -14,7 +14,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from muvo_jax.config import LastSeen, ModelConfig
+from muvo_jax import head as head_lib
+from muvo_jax.config import KNOWN_HEADS, LastSeen, ModelConfig
 from muvo_jax.ops import motion as motion_ops
 from muvo_jax.types import UNTIMED_FIELDS, Array, Batch, LatentState, Memory, Motion, Vantage
 
@@ -23,8 +24,14 @@ def guessed_heads(config: ModelConfig) -> tuple[str, ...]:
     """The heads whose decoders see the memory: what cannot be moved (nothing moves without ranges) is not guessed."""
     if not isinstance(config.first_guess, LastSeen) or config.lidar is None:
         return ()
-    seen = ("image",) if config.camera is not None else ()
-    return tuple(head for head in (*seen, "range_view", "occupancy") if head in config.heads)
+    guides = {name: head_lib.get(name).guide for name in KNOWN_HEADS if name in config.heads}
+    return tuple(name for name, guide in guides.items() if guide is not None
+                 and (guide.view != "image" or config.camera is not None))
+
+
+def views(heads: tuple[str, ...]) -> frozenset[str]:
+    """Whose memory the decoders of these guessed heads look at; see head.Guide."""
+    return frozenset(guide.view for name in heads if (guide := head_lib.get(name).guide) is not None)
 
 
 def inputs(config: ModelConfig) -> dict[str, tuple[int, ...]]:
@@ -33,7 +40,7 @@ def inputs(config: ModelConfig) -> dict[str, tuple[int, ...]]:
     fields: dict[str, tuple[int, ...]] = {}
     if heads:
         fields["range_view"] = (config.range_view.rows, config.range_view.columns, 4)
-    if "image" in heads:
+    if "image" in views(heads):
         fields |= {"image": (*config.image_size, 3), "intrinsics": (3, 3), "camera_to_ego": (4, 4)}
     return fields
 
@@ -113,7 +120,7 @@ def _remembered(config: ModelConfig, batch: Batch, poses: Array) -> Memory | Non
     heads = guessed_heads(config)
     if not heads:
         return None
-    with_image = "image" in heads
+    with_image = "image" in views(heads)
     pick = lambda name: jnp.asarray(getattr(batch, name)) if with_image else None
     return Memory(poses, jnp.asarray(batch.range_view), pick("image"), pick("intrinsics"), pick("camera_to_ego"))
 
@@ -126,7 +133,7 @@ def empty(config: ModelConfig, batch_size: int) -> Memory | None:
     lead, view = (batch_size, stream_places(config)), config.range_view
     memory = Memory(jnp.zeros((*lead, 3), jnp.float32),
                     jnp.full((*lead, view.rows, view.columns, 4), -1.0, jnp.float32))
-    if "image" not in heads:
+    if "image" not in views(heads):
         return memory
     return dataclasses.replace(memory, image=jnp.zeros((*lead, *config.image_size, 3), jnp.uint8),
                                intrinsics=jnp.zeros((batch_size, 3, 3), jnp.float32),

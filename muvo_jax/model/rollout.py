@@ -139,7 +139,8 @@ def observe(model: WorldModel, variables: Variables, key: jax.Array, batch: Batc
     batch.validate()
     checks.observation("observe", model, batch)
     checks.forward_mode("observe", model, variables, batch)
-    return _observe(model, variables, sample_keys(key, batch.batch_size), batch, sampled)
+    keys = sample_keys(key, batch.batch_size)
+    return _observe_window(model, variables, batch, keys, train=False, sampled=sampled)[0]
 
 
 def imagine(model: WorldModel, variables: Variables, key: jax.Array, state: LatentState,
@@ -265,9 +266,7 @@ def _swap_time(leaf):
     return jnp.swapaxes(leaf, 0, 1)
 
 
-@functools.partial(jax.jit, static_argnames=("model", "sampled"))
-def _observe(model, variables, keys, batch, sampled):
-    return observe_window(model, variables, batch, keys, train=False, sampled=sampled)[0]
+_observe_window = jax.jit(observe_window, static_argnames=("model", "train", "sampled"))
 
 
 @functools.partial(jax.jit, static_argnames=("model", "heads"))

@@ -21,11 +21,12 @@ import jax
 import jax.numpy as jnp
 from flax import linen
 
-from muvo_jax.config import ModelConfig, TokenLatent, TransformerFusion, ZeroGuess
-from muvo_jax.model import camera, fusion, glimpse, guided, heads, lidar, measurements, outputs, tokens, transition
+from muvo_jax import head as head_lib
+from muvo_jax.config import KNOWN_HEADS, ModelConfig, TokenLatent, TransformerFusion, ZeroGuess
+from muvo_jax.model import camera, decoders, fusion, glimpse, guided, lidar, measurements, tokens, transition
 from muvo_jax.model import memory as memory_lib
 from muvo_jax.nn import init as init_lib
-from muvo_jax.nn import layers, norm
+from muvo_jax.nn import norm
 from muvo_jax.types import (
     BATCH_FIELDS,
     UNTIMED_FIELDS,
@@ -44,7 +45,7 @@ ROUTE_MAP_SIZE = (64, 64)
 
 
 class Network(linen.Module):
-    """All parameters under one roof; WorldModel is the public face."""
+    """What stands around the transition: from frames to embeddings, from states to outputs."""
 
     config: ModelConfig
 
@@ -63,14 +64,13 @@ class Network(linen.Module):
         if config.speed:
             self.speed = measurements.SpeedEncoder(config)
         self.fusion = fusion.REGISTRY[type(config.fusion)](config)
-        self.transition = transition.REGISTRY[type(config.latent)](config)
         guessed = memory_lib.guessed_heads(config)
-        self.decoders = {name: guided.GuidedHead(config, name) if name in guessed
-                         else head.build(config, head.channels_of(config)) for name, head in heads.TABLE.items()
-                         if name in config.heads}
+        described = {name: head_lib.get(name) for name in KNOWN_HEADS if name in config.heads}
+        self.decoders = {name: guided.GuidedHead(config, head.guide) if head.guide is not None and name in guessed
+                         else head.build(config) for name, head in described.items()}
         if not isinstance(config.first_guess, ZeroGuess):
-            self.first_guess = {name: outputs.FirstGuess() for name in outputs.FIRST_GUESS_HEADS
-                                if name in config.heads}
+            self.first_guess = {name: decoders.FirstGuess() for name, head in described.items()
+                                if head.average is not None}
 
     def encode(self, frames: dict[str, jax.Array], mode: norm.Mode, keys: jax.Array | None) -> jax.Array:
         measured = []
@@ -84,23 +84,6 @@ class Network(linen.Module):
         image_map = self.camera(frames, mode) if self.config.camera is not None else None
         lidar_map = self.lidar(frames, mode) if self.config.lidar is not None else None
         return self.fusion(image_map, lidar_map, measured, mode, keys)
-
-    def observe_step(self, *args):
-        return self.transition.observe_step(*args)
-
-    def imagine_step(self, noise: jax.Array, state: LatentState, action: jax.Array) -> tuple[LatentState, Gaussian]:
-        following, prior = self.transition.imagine_step(noise, state, action)
-        if self.config.tracks_motion and self.config.kinematics is None:
-            assert state.vantage is not None  # of a model that tracks its motion
-            vantage = memory_lib.moved_on(state.vantage, self.ego_motion(following.features))
-            following = dataclasses.replace(following, vantage=vantage)
-        return following, prior
-
-    def ego_motion(self, features: jax.Array) -> Motion:
-        """The step that led to states, as the head says."""
-        value = self.decoders["ego_motion"](self.read(features, "ego_motion"))[1]
-        value = value * layers.per_channel(jnp.asarray(heads.TABLE["ego_motion"].unit(self.config)), value.ndim)
-        return Motion(value[..., :3], value[..., 3])
 
     def decode(self, features: jax.Array, vantage: Vantage | None, memory: Memory | None, rows: jax.Array | None,
                names: tuple[str, ...]) -> dict[str, dict[int, jax.Array]]:
@@ -124,15 +107,14 @@ class Network(linen.Module):
         """What a head decodes of the features: with the 2D latent its group of tokens, or all of them pooled."""
         if not isinstance(self.config.latent, TokenLatent):
             return features
-        group = heads.TABLE[head].tokens
+        group = head_lib.get(head).tokens
         return tokens.pool(features, self.config) if group is None else tokens.read(features, group, self.config)
 
-    def everything(self, frames: dict[str, jax.Array], noise: StepNoise, action: jax.Array, state: LatentState,
-                   is_first: jax.Array) -> dict[str, dict[int, jax.Array]]:
-        """Touches every parameter once; only its shapes are ever computed."""
-        state, _ = self.observe_step(noise, state, action, self.encode(frames, norm.Mode(), None), is_first)
+    def everything(self, frames: dict[str, jax.Array], state: LatentState) -> jax.Array:
+        """Touches every parameter once; only its shapes are ever computed. Returns the embedding."""
         memory = memory_lib.empty(self.config, 1)
-        return self.decode(state.features, state.vantage, memory, jnp.zeros((1,), jnp.int32), self.config.heads)
+        self.decode(state.features, state.vantage, memory, jnp.zeros((1,), jnp.int32), self.config.heads)
+        return self.encode(frames, norm.Mode(), None)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -168,8 +150,7 @@ class WorldModel:
     def variable_shapes(self) -> dict[str, Any]:
         """The variables as jax.ShapeDtypeStruct leaves."""
         # The plain convolutions trace fastest, and the parameters do not depend on the form.
-        network = Network(dataclasses.replace(self.config, convolution="xla"))
-        return dict(_variable_shapes(network))
+        return dict(_variable_shapes(dataclasses.replace(self.config, convolution="xla")))
 
     def init(self, key: jax.Array, batch: Batch | None = None) -> dict[str, Any]:
         """Fresh variables as float32 NumPy arrays; see muvo_jax.nn.init for the rules.
@@ -183,7 +164,8 @@ class WorldModel:
         """
         if batch is not None:
             self._frames(batch)
-        constants = {**heads.initial_constants(self.config), **transition.initial_constants(self.config),
+        constants = {**decoders.initial_constants(self.config), **guided.initial_constants(self.config),
+                     **transition.initial_constants(self.config),
                      **fusion.initial_constants(self.config)}
         return init_lib.fill(self.variable_shapes(), key, constants)
 
@@ -242,7 +224,7 @@ class WorldModel:
           the state to go on from, and (prior, posterior). Its sample is the posterior's, or the prior's where
           noise.use_prior says so.
         """
-        return self._apply(variables, "observe_step", noise, state, action, embedding, is_first)
+        return self._move(variables, "observe_step", noise, state, action, embedding, is_first)
 
     def imagine_step(self, variables: Variables, noise: jax.Array, state: LatentState,
                      action: jax.Array) -> tuple[LatentState, Gaussian]:
@@ -250,7 +232,13 @@ class WorldModel:
 
         noise: standard normal numbers of the shape of the stochastic state, or zeros.
         """
-        return self._apply(variables, "imagine_step", noise, state, action)
+        following, prior = self._move(variables, "imagine_step", noise, state, action)
+        if self.config.tracks_motion and self.config.kinematics is None:
+            assert state.vantage is not None  # of a model that tracks its motion
+            arrival = self.ego_motion(variables, following)
+            vantage = memory_lib.moved_on(state.vantage, Motion(arrival[..., :3], arrival[..., 3]))
+            following = dataclasses.replace(following, vantage=vantage)
+        return following, prior
 
     def ego_motion(self, variables: Variables, states: LatentState) -> jax.Array:
         """What the head of that name says of states [*L, ...]: [*L, 4], as Batch.ego_motion."""
@@ -270,7 +258,7 @@ class WorldModel:
         Returns:
           Predictions, float32 [..., *size / scale, channels]: image in [0, 1] where trained (no clipping), range_view
           in metres, occupancy as logits [..., X, Y, Z, 2], action in (-1, 1) [..., 2], at full size only; what other
-          heads return, model/heads.py says.
+          heads return, their files in muvo_jax/heads say.
 
         Raises:
           ValueError: for a head that the model does not have, features of another shape, or states without the memory
@@ -293,8 +281,14 @@ class WorldModel:
         else:
             vantage, rows = memory_lib.check(self.config, states, memory, rows, lead)
         flat = self._apply(variables, "decode", features.reshape(-1, *shape), vantage, memory, rows, names)
-        return Predictions({name: {scale: _finished(value, name, scale, self.config).reshape(*lead, *value.shape[1:])
+        finish = lambda name, scale, value: head_lib.get(name).finish(value, scale, self.config)
+        return Predictions({name: {scale: finish(name, scale, value).reshape(*lead, *value.shape[1:])
                                    for scale, value in scales.items()} for name, scales in flat.items()})
+
+    def _move(self, variables: Variables, method: str, *args) -> Any:
+        """A step of the transition, by its own part of the variables."""
+        own = {kind: tree["transition"] for kind, tree in variables.items() if "transition" in tree}
+        return transition.REGISTRY[type(self.config.latent)](self.config).apply(own, *args, method=method)
 
     def _apply(self, variables: Variables, method: str, *args, **options) -> Any:
         return Network(self.config).apply(variables, *args, method=method, **options)
@@ -334,22 +328,17 @@ def inputs(config: ModelConfig) -> dict[str, tuple[int, ...]]:
     return fields | memory_lib.inputs(config)
 
 
-def _finished(value: jax.Array, name: str, scale: int, config: ModelConfig) -> jax.Array:
-    if name == "range_view" and config.range_view_points == "beams":
-        value = outputs.along_beams(value, scale, config)
-    unit = heads.TABLE[name].unit(config)
-    if isinstance(unit, tuple):
-        return value * layers.per_channel(jnp.asarray(unit, jnp.float32), value.ndim)
-    return value if unit == 1.0 else value * unit
-
-
 @functools.lru_cache(maxsize=8)
-def _variable_shapes(network: Network) -> dict[str, Any]:
-    config = network.config
+def _variable_shapes(config: ModelConfig) -> dict[str, Any]:
+    network, moving = Network(config), transition.REGISTRY[type(config.latent)](config)
     frames = {name: jax.ShapeDtypeStruct((1, *shape), BATCH_FIELDS[name][0]) for name, shape in inputs(config).items()}
-    state = WorldModel(config).initial_state(1)
+    state, key = moving.initial_state(config, 1), jax.random.key(0)
     noise = StepNoise(state.stochastic, state.stochastic, jnp.zeros((1,), jnp.bool_))
-    action = jax.ShapeDtypeStruct((1, 2), jnp.float32)
-    init = functools.partial(network.init, method="everything")
-    return jax.eval_shape(init, jax.random.key(0), frames, noise, action, state,
-                          jax.ShapeDtypeStruct((1,), jnp.bool_))
+    action, is_first = jnp.zeros((1, 2), jnp.float32), jnp.zeros((1,), jnp.bool_)
+
+    def fresh(frames):
+        embedding, around = network.init_with_output(key, frames, state, method="everything")
+        own = moving.init(key, noise, state, action, embedding, is_first, method="observe_step")
+        return {kind: {**tree, **({"transition": own[kind]} if kind in own else {})} for kind, tree in around.items()}
+
+    return jax.eval_shape(fresh, frames)

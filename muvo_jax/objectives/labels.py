@@ -10,9 +10,8 @@ from __future__ import annotations
 import jax.numpy as jnp
 
 from muvo_jax import types
+from muvo_jax.head import SCALES
 from muvo_jax.ops import resample
-
-SCALES = (1, 2, 4)
 
 
 def image_labels(image: types.ArrayLike) -> dict[int, types.Array]:

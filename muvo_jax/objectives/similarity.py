@@ -30,7 +30,7 @@ def frame_similarity(prediction: types.Array, target: types.Array) -> types.Arra
     if min(prediction.shape[-3:-1]) < WINDOW_PX:
         raise ValueError(f"structural similarity of pictures of {prediction.shape[-3]}x{prediction.shape[-2]} pixels: "
                          f"they must have at least {WINDOW_PX} on a side. The smallest scale is a quarter of "
-                         f"model.image_size; choose larger images or loss.ssim=0.")
+                         f"model.image_size; choose larger images or loss.image_similarity=0.")
     line = jnp.asarray(window().sum(axis=0))
 
     def blur(image: jax.Array) -> jax.Array:

@@ -12,21 +12,20 @@ import jax
 import jax.numpy as jnp
 
 from muvo_jax import config as config_lib
+from muvo_jax import head as head_lib
 from muvo_jax import types
-from muvo_jax.model import heads as heads_lib
-from muvo_jax.objectives import kl, perceptual, terms
+from muvo_jax.objectives import kl, perceptual
 
 
 def term_weights(loss: config_lib.LossConfig, heads: tuple[str, ...]) -> dict[str, float]:
     """{term: weight} of every term these heads have; a weight of 0 leaves the term out."""
-    weights = {term: getattr(loss, field) * factor
-               for head in heads for term, (field, factor) in terms.TABLE[head].weights.items()}
+    weights = {term: weight for head in heads for term, weight in head_lib.get(head).weights(loss).items()}
     return weights | {"kl": loss.kl}
 
 
 def loss_sums(predictions: types.Predictions, batch: types.Batch, observed: types.Observed, *,
               model: config_lib.ModelConfig, loss: config_lib.LossConfig, keys: types.Array,
-              frozen: perceptual.FrozenEncoder | None = None) -> dict[str, terms.Sums]:
+              frozen: perceptual.FrozenEncoder | None = None) -> dict[str, head_lib.Sums]:
     """Reduces predictions and targets to sums that add over samples and devices.
 
     Args:
@@ -40,15 +39,15 @@ def loss_sums(predictions: types.Predictions, batch: types.Batch, observed: type
     Raises:
       ValueError: where a head has no target or lacks a scale.
     """
-    sums: dict[str, terms.Sums] = {"kl": kl.balanced_kl_sums(observed.posterior, observed.prior,
+    sums: dict[str, head_lib.Sums] = {"kl": kl.balanced_kl_sums(observed.posterior, observed.prior,
                                                              balance=loss.kl_balance, numerics=model.numerics)}
     for head in model.heads:
         check_head(head, predictions, batch, model, loss)
-        sums |= terms.TABLE[head].sums(terms.Inputs(predictions.scales(head), batch, model, loss, keys, frozen))
+        sums |= head_lib.get(head).losses(head_lib.Learned(predictions.scales(head), batch, model, loss, keys, frozen))
     return sums
 
 
-def combine(sums: Mapping[str, terms.Sums], weights: Mapping[str, float]) -> dict[str, types.Array]:
+def combine(sums: Mapping[str, head_lib.Sums], weights: Mapping[str, float]) -> dict[str, types.Array]:
     """Finishes the sums of a whole batch: {term: value} for every term whose weight is not 0, and the weighted "total".
 
     The terms themselves are not multiplied by their weights.
@@ -86,14 +85,14 @@ def check_head(head: str, predictions: types.Predictions, batch: types.Batch, mo
     """Raises ValueError unless the head was predicted at its scales and the batch has its targets."""
     if head not in predictions:
         raise ValueError(f"losses: the model has the head {head!r}, the predictions have {sorted(predictions)}.")
-    for field in config_lib.head_targets(head, model, loss):
+    described = head_lib.get(head)
+    for field in described.learns_from(model, loss):
         if getattr(batch, field, None) is None:
-            term = config_lib.TERM_TARGETS.get(field)
+            term = described.term_targets.get(field)
             what, remedy = ((f"loss.{term.weight} is on", "Set it to 0") if term else
                             (f"the model has the head {head!r}", "Remove the head (--heads, model.heads)"))
             raise ValueError(f"losses: {what}, but the batch has no {field}. {remedy} or train on a recording that has "
                              f"it.")
-    scales = heads_lib.TABLE[head].scales
     predicted = sorted(predictions.scales(head))
-    if predicted != sorted(scales):
-        raise ValueError(f"losses: head {head!r} predicts scales {predicted}, expected {scales}.")
+    if predicted != sorted(described.scales):
+        raise ValueError(f"losses: head {head!r} predicts scales {predicted}, expected {described.scales}.")

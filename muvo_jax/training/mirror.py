@@ -15,6 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from muvo_jax import config as config_lib
+from muvo_jax import head as head_lib
 from muvo_jax import types
 
 _SITE = 0x3D1F  # separates these draws from all others made with the same sample key
@@ -86,12 +87,12 @@ def randomly(batch: types.Batch, keys: types.Array) -> types.Batch:
 def check(model: config_lib.ModelConfig) -> None:
     """Raises ValueError where a sensor or grid of the model has the car beside its middle: a flip is no mirror then."""
     grid, aside = model.voxels, None
+    drawn = {head_lib.get(name).tokens for name in model.heads}
     middle_m = grid.origin_m[1] + 0.5 * grid.shape[1] * grid.voxel_size_m
-    if not {"occupancy", "birds_eye"}.isdisjoint(model.heads) and abs(middle_m) > _SYMMETRIC_M:
+    if "occupancy" in drawn and abs(middle_m) > _SYMMETRIC_M:
         aside = f"the middle of model.voxels lies at y = {middle_m:g} m"
     lidar_m = model.range_view.position_m[1]
-    seen = model.lidar is not None or not {"range_view", "semantic_range_view"}.isdisjoint(model.heads)
-    if seen and abs(lidar_m) > _SYMMETRIC_M:
+    if (model.lidar is not None or "range_view" in drawn) and abs(lidar_m) > _SYMMETRIC_M:
         aside = f"the lidar (model.range_view.position_m) lies at y = {lidar_m:g} m"
     if aside:
         raise ValueError(f"augmentation.mirror=true exchanges left and right about the middle of the car, but {aside}. "

@@ -14,6 +14,7 @@ import jax
 import numpy as np
 
 from muvo_jax import config as config_lib
+from muvo_jax import head as head_lib
 from muvo_jax import types
 from muvo_jax.model import world_model
 from muvo_jax.objectives import perceptual
@@ -67,7 +68,7 @@ def expected_batch(config: config_lib.Config, windows: int, *,
       recorded: what every frame of the recording has (sequences.in_every_frame); by default what the built-in town has
         of those that every batch brings along, whatever the model reads.
     """
-    model, prefix = config.model, (windows, config.data.frames)
+    model, prefix, targets = config.model, (windows, config.data.frames), head_lib.targets(config)
 
     def shape(dtype, *sizes) -> Any:
         return jax.ShapeDtypeStruct((windows, *sizes), dtype)
@@ -78,9 +79,9 @@ def expected_batch(config: config_lib.Config, windows: int, *,
     fields = {name: timed(types.BATCH_FIELDS[name][0], *sizes) for name, sizes in world_model.inputs(model).items()}
     if model.lidar is not None:
         fields["range_view"] = timed(np.float32, model.range_view.rows, model.range_view.columns, 4)
-    if model.camera is not None or "image" in config.targets:
+    if model.camera is not None or "image" in targets:
         fields |= {"intrinsics": shape(np.float32, 3, 3), "camera_to_ego": shape(np.float32, 4, 4)}
-    fields |= {name: timed(types.BATCH_FIELDS[name][0], *sizes) for name, sizes in config.targets.items()}
+    fields |= {name: timed(types.BATCH_FIELDS[name][0], *sizes) for name, sizes in targets.items()}
     fields |= {name: timed(types.BATCH_FIELDS[name][0]) for name in sorted(TOWN_RECORDS.intersection(recorded))}
     fields["action"] = timed(np.float32, 2)
     return types.Batch(is_first=timed(np.bool_), **fields)

@@ -10,6 +10,7 @@ import jax
 import numpy as np
 
 from muvo_jax import config as config_lib
+from muvo_jax import head as head_lib
 from muvo_jax import recordings, types
 from muvo_jax import run as run_lib
 from muvo_jax.data import fitting, pipeline, schema
@@ -21,15 +22,6 @@ from muvo_jax.training import state as state_lib
 from muvo_jax.training import step as step_lib
 
 TRAINING_MEAN_FRAMES = 512
-
-
-# Metric of protocol.evaluate -> its name in metrics.jsonl, for the screen its label and form.
-SHOWN = {
-    "psnr_db": ("imagined_psnr_db", "imagined PSNR", "{:.2f} dB"),
-    "chamfer_m": ("imagined_chamfer_m", "Chamfer", "{:.2f} m"),
-    "iou_occ_above_observed": ("imagined_iou_occ_above", "IoU+ above the road", "{:.3f}"),
-    "iou_occ_observed": ("imagined_iou_occ", "IoU+", "{:.3f}"),
-}
 
 
 class Validator:
@@ -63,9 +55,9 @@ class Validator:
             self._baselines[split] = protocol.evaluate(None, None, batches, self.config, sources=others)["imagined"]
         imagined = report["imagined"] | self._baselines[split]
         for source, scores in imagined.items():
-            for metric, (name, *_) in SHOWN.items():
-                if metric in scores:
-                    sums[name if source == "model" else f"{source}_{metric}"] = scores[metric]["mean"]
+            for name, metric in logged().items():
+                if name in scores:
+                    sums[metric.logged if source == "model" else f"{source}_{name}"] = scores[name]["mean"]
         answers = {f"action_shuffle_{head}": ratio["mean"] for head, ratio in report["action_shuffle"].items()}
         return sums | answers | {"skill": skill.skill(imagined)}
 
@@ -114,17 +106,25 @@ def training_sums(frames: pipeline.Frames, most_frames: int = TRAINING_MEAN_FRAM
     return mean
 
 
+def logged() -> dict[str, head_lib.Metric]:
+    """The scores of imagined frames that are logged, by the names that protocol.evaluate gives them."""
+    return {name: metric for name, metric in head_lib.metrics().items() if metric.logged}
+
+
 def text(numbers: Mapping[str, float]) -> str:
     """One line for the screen: the model, behind it in brackets the baseline that the skill refers to."""
     shown = [f"loss {numbers['total']:.4f}"]
     if "psnr_db" in numbers:
         shown.append(f"observed PSNR {numbers['psnr_db']:.2f} dB")
     reference = next((source for source in skill.REFERENCES if any(name.startswith(source) for name in numbers)), "")
-    for metric, (name, label, form) in SHOWN.items():
-        if name in numbers:
-            beside = numbers.get(f"{reference}_{metric}")
-            shown.append(f"{label} {form.format(numbers[name])}"
-                         + (f" ({reference.replace('_', '-')} {form.format(beside)})" if beside is not None else ""))
-    ratios = [f"{numbers[name]:.2f}" for head in protocol.HEADS if (name := f"action_shuffle_{head}") in numbers]
+    imagined = "imagined "
+    for name, metric in logged().items():
+        if metric.logged in numbers:
+            form = lambda value, metric=metric: f"{value:.{max(2, metric.decimals - 1)}f} {metric.unit}".rstrip()
+            beside = numbers.get(f"{reference}_{name}")
+            shown.append(f"{imagined}{metric.label} {form(numbers[metric.logged])}"
+                         + (f" ({reference.replace('_', '-')} {form(beside)})" if beside is not None else ""))
+            imagined = ""
+    ratios = [f"{numbers[name]:.2f}" for head in head_lib.shown() if (name := f"action_shuffle_{head}") in numbers]
     shown += [f"action shuffle {' / '.join(ratios)}"] if ratios else []
     return "  ".join([*shown, f"skill {numbers['skill']:+.3f}"] if "skill" in numbers else shown)

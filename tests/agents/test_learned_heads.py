@@ -9,11 +9,12 @@ import pytest
 from worlds import CONFIG, HORIZON, bank
 
 from muvo_jax import config as config_lib
+from muvo_jax import head as head_lib
 from muvo_jax import types
 from muvo_jax.agents import environment as environment_lib
 from muvo_jax.agents import rewards
 from muvo_jax.model import rollout, world_model
-from muvo_jax.objectives import terms, total
+from muvo_jax.objectives import total
 from muvo_jax.ops import motion as motion_ops
 from muvo_jax.run import Run
 
@@ -37,8 +38,8 @@ def test_their_loss_terms_by_hand():
     values, loss = {}, config_lib.LossConfig()
     for head in LEARNED:
         total.check_head(head, predictions, batch, MODEL.config, loss)
-        sums = terms.TABLE[head].sums(terms.Inputs(predictions.scales(head), batch, MODEL.config, loss,
-                                                   jax.random.split(jax.random.key(0), 1)))
+        sums = head_lib.get(head).losses(head_lib.Learned(predictions.scales(head), batch, MODEL.config, loss,
+                                                          jax.random.split(jax.random.key(0), 1)))
         values |= {name: float(value) for part, found in sums.items() for name, value in found.terms(part).items()}
     want = {"reward": (0.25 + 1.0) / 2, "continue": (np.log(2) + np.log1p(np.exp(2))) / 2,
             "ego_motion": 1.0 + 1.0 + 1.0, "ego_speed": (1.0 + 2.0) / 2}  # where a window begins there is no motion

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import recording_samples as samples
 
+from muvo_jax import head as head_lib
 from muvo_jax import presets
 from muvo_jax.data import fitting, pipeline, prepare, schema
 from muvo_jax.data.muvo import reader as muvo_reader
@@ -36,7 +37,7 @@ def test_the_town_teaches_every_optional_head(recording):
     assert model.config.model.semantic_classes == len(boxes.CLASSES) == CONFIG.model.semantic_classes
     batch = pipeline.Frames(recording, model.config).batch([pipeline.windows_lib.Window(
         recording.sequences[0], 0, 2, 1)])
-    for field, shape in CONFIG.targets.items():
+    for field, shape in head_lib.targets(CONFIG).items():
         assert getattr(batch, field).shape == (1, 2, *shape)
     raw = recording.read(recording.sequences[0], 0)
     # A scan hits what the camera sees there: points in view have the class of their pixel, but for edges.

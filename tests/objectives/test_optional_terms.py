@@ -9,11 +9,12 @@ import numpy as np
 import pytest
 
 from muvo_jax import config as config_lib
+from muvo_jax import head as head_lib
 from muvo_jax import types
 from muvo_jax.interop import reference_preprocess
 from muvo_jax.interop.parity import golden
 from muvo_jax.nn import resnet
-from muvo_jax.objectives import classification, instances, perceptual, similarity, terms, total
+from muvo_jax.objectives import classification, instances, perceptual, similarity, total
 
 MODEL, LOSS = config_lib.ModelConfig(), config_lib.LossConfig()
 ROWS, COLUMNS = 8, 16
@@ -23,7 +24,7 @@ def values(head, predictions, loss=LOSS, axis_name=None, frozen=None, **fields):
     """{term: value} of one head for a batch of these fields."""
     lead = next(iter(fields.values())).shape[:2]
     batch = types.Batch(action=np.zeros((*lead, 2), np.float32), is_first=np.zeros(lead, bool), **fields)
-    sums = terms.TABLE[head].sums(terms.Inputs(predictions, batch, MODEL, loss, None, frozen))
+    sums = head_lib.get(head).losses(head_lib.Learned(predictions, batch, MODEL, loss, None, frozen))
     sums = sums if axis_name is None else jax.lax.psum(sums, axis_name)
     return {term: value for name, part in sums.items() for term, value in part.terms(name).items()}
 
@@ -82,7 +83,7 @@ def test_optional_heads_do_not_depend_on_how_devices_share_the_batch():
                                           **{name: maps[name] for name in names}).items()}
 
     whole = jax.jit(every)(case)
-    assert set(whole) == {term for head in case[0] for term in terms.TABLE[head].weights}
+    assert set(whole) == {term for head in case[0] for term in head_lib.get(head).weights(loss)}
     parts = jax.tree.map(lambda leaf: leaf.reshape(2, 2, *leaf.shape[1:]), case)
     spread = jax.jit(jax.vmap(lambda part: every(part, "parts"), axis_name="parts"))(parts)
     for name, value in whole.items():

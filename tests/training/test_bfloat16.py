@@ -18,12 +18,12 @@ WINDOWS, FRAMES, SIDE_PX = 4, 3, 32
 
 
 def config_of(latent):
-    tiny = presets.tiny()
-    model = dataclasses.replace(tiny.model, latent=latent, compute_dtype="bfloat16", camera="none", route=False,
-                                heads=("range_view", "action"), dropout=0.0, prior_dropout=0.0,
-                                range_view=config_lib.RangeViewGeometry(rows=SIDE_PX, columns=SIDE_PX))
+    tiny = config_lib.override_all(presets.tiny(), {
+        "model.latent": latent, "model.compute_dtype": "bfloat16", "model.camera": "none", "model.route": False,
+        "model.heads": ("range_view", "action"), "model.fusion.dropout": 0.0, "model.prior_dropout": 0.0,
+        "model.range_view": config_lib.RangeViewGeometry(rows=SIDE_PX, columns=SIDE_PX)})
     return dataclasses.replace(
-        tiny, model=model, data=dataclasses.replace(tiny.data, frames=FRAMES),
+        tiny, data=dataclasses.replace(tiny.data, frames=FRAMES),
         optimizer=config_lib.OptimizerConfig(learning_rate=3e-3),
         train=dataclasses.replace(tiny.train, batch=WINDOWS, steps=20))
 

@@ -1,7 +1,5 @@
 """Pictures: orientation, colours, tags and files. (How they look has to be looked at.)"""
 
-import dataclasses
-
 import numpy as np
 import pytest
 from PIL import Image
@@ -133,8 +131,8 @@ def test_write_dream_writes_readable_files_of_every_frame(tmp_path):
 
 def test_a_baseline_stands_beside_the_dream_on_every_sheet(tmp_path):
     """Without the optional maps, which it does not predict: there its place stays empty."""
-    maps = {"depth_m": np.ones((4, 8), np.float32)}
-    views = [dataclasses.replace(_view(seed), **maps) for seed in range(2)]
+    maps = {"depth": np.ones((4, 8), np.float32)}
+    views = [_view(seed) | maps for seed in range(2)]
     sizes = []
     for beside in ({}, {"warp-last": [_view(2), _view(3)]}):
         paths = sheets.write_dream(tmp_path, views, {"world model": views}, np.zeros((2, 2)), SCENE, context=1,
@@ -146,7 +144,7 @@ def test_a_baseline_stands_beside_the_dream_on_every_sheet(tmp_path):
 
 
 def test_a_recording_with_a_camera_alone_has_no_space_sheet(tmp_path):
-    views = [sheets.View(image=_view().image)] * 2
+    views = [sheets.View(image=_view()["image"])] * 2
     paths = sheets.write_dream(tmp_path, views, {"world model": views}, np.zeros((2, 2)), SCENE, context=1, title="t")
     assert sorted(path.name for path in paths) == ["dream.gif", "dream_sensors.png"]
 
@@ -155,8 +153,8 @@ def test_views_of_frames_picks_the_sample():
     frames = {"image": np.zeros((2, 3, 4, 4, 3)), "occupancy": np.ones((2, 3, 2, 2, 2), bool)}
     frames["image"][1] = 1.0
     views = sheets.views_of_frames(frames, 1)
-    assert len(views) == 3 and views[0].image.min() == 1.0 and views[0].range_view is None
-    assert views[2].occupancy.dtype == np.uint8
+    assert len(views) == 3 and views[0]["image"].min() == 1.0 and "range_view" not in views[0]
+    assert views[2]["occupancy"].dtype == np.uint8
 
 
 def test_curves_leave_gaps_and_survive_constant_and_missing_values(tmp_path):
@@ -189,11 +187,11 @@ def test_optional_maps_have_panels_where_truth_has_them_too(tmp_path):
     assert len({tuple(pixel) for pixel in picture.reshape(-1, 3).tolist()}) == 4 and not picture[1, 1].any()
     plan = panels.ground_plan(np.array([[0, 0], [3, 0]], np.uint8), 2)  # a vehicle ahead on the right
     np.testing.assert_array_equal(plan[0, 1], panels.class_image(np.array([3], np.uint8))[0])
-    maps = {"depth_m": np.ones((4, 8), np.float32), "image_classes": np.ones((4, 8), np.uint8),
-            "birds_eye_classes": np.ones((4, 4), np.uint8)}
-    truth, dream = sheets.View(**maps), sheets.View(**maps, range_view_classes=np.ones((4, 8), np.uint8))
+    maps = {"depth": np.ones((4, 8), np.float32), "semantic_image": np.ones((4, 8), np.uint8),
+            "birds_eye": np.ones((4, 4), np.uint8)}
+    truth, dream = sheets.View(**maps), sheets.View(**maps, semantic_range_view=np.ones((4, 8), np.uint8))
     sizes = []
-    for view in (truth, sheets.View(depth_m=maps["depth_m"])):
+    for view in (truth, sheets.View(depth=maps["depth"])):
         paths = sheets.write_dream(tmp_path, [view] * 2, {"world model": [dream] * 2}, np.zeros((2, 2)), SCENE,
                                    context=1, title="t", animate=False)
         sizes.append({path.name: Image.open(path).height for path in paths})

@@ -9,9 +9,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from muvo_jax import config as config_lib
 from muvo_jax.interop import names, weights_rule
 from muvo_jax.interop.parity import cases, rounding
-from muvo_jax.model import decoders, heads
+from muvo_jax.model import decoders
 from muvo_jax.nn import norm
 
 EVAL = norm.Mode()
@@ -81,7 +82,7 @@ def action_check(entry: str, module: decoders.ActionDecoder, features: np.ndarra
 
 def birds_eye_entries(prefix: str, scales: Mapping[int, jax.Array], axis: int) -> Iterator[tuple[str, np.ndarray]]:
     """The reference's three outputs for each scale of our head "birds_eye", channels at `axis`."""
-    classes = heads.BIRDS_EYE_CLASSES
+    classes = config_lib.BIRDS_EYE_CLASSES
     parts = {"segmentation": slice(0, classes), "instance_offset": slice(classes, classes + 2),
              "instance_center": slice(classes + 2, classes + 3)}
     for scale, value in scales.items():

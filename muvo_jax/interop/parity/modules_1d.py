@@ -11,7 +11,7 @@ import numpy as np
 
 from muvo_jax import config as config_lib
 from muvo_jax.interop.parity import cases, drawing
-from muvo_jax.model import decoders, heads, rollout, world_model
+from muvo_jax.model import decoders, rollout, world_model
 from muvo_jax.nn import attention, layers, pyramid, resnet
 from muvo_jax.types import StepNoise
 
@@ -107,8 +107,8 @@ def decoded(context: cases.Context) -> Checks:
             (voxels, state[:1], "decoders_occupancy/", "voxel_decoder/voxel", STYLED_TOLERANCE)):
         for scale, value in drawing.run(module, rows, where=where).items():
             yield cases.Check(f"{name}_{scale}", drawing.channels_first(value), tolerance)
-    head = heads.TABLE["birds_eye"]
-    birds_eye = drawing.run(head.build(CONFIG, head.channels_of(CONFIG)), state[:1], where="decoders_birds_eye/")
+    birds_eye = drawing.run(decoders.of_ground_plan(CONFIG, config_lib.BIRDS_EYE_CLASSES), state[:1],
+                            where="decoders_birds_eye/")
     for entry, value in drawing.birds_eye_entries("bev_decoder", birds_eye, 1):
         yield cases.Check(entry, value, TOLERANCE)
 

@@ -10,7 +10,7 @@ import numpy as np
 from muvo_jax import config as config_lib
 from muvo_jax.interop import unused_modules
 from muvo_jax.interop.parity import cases, drawing, modules_1d
-from muvo_jax.model import decoders, heads, token_decoders, token_transition
+from muvo_jax.model import decoders, token_transition
 from muvo_jax.nn import resnet
 
 TOLERANCE, STYLED_TOLERANCE = modules_1d.TOLERANCE, modules_1d.STYLED_TOLERANCE
@@ -67,8 +67,8 @@ def _transition(context: cases.Context, name: str, config: config_lib.ModelConfi
 
 def decoded(context: cases.Context) -> Checks:
     width = CONFIG.decoder_channels
-    plane = lambda channels, stages: token_decoders.TokenDecoder(channels, width, width, stages)
-    voxels = token_decoders.TokenDecoder(2, 2 * CONFIG.occupancy_channels, CONFIG.occupancy_channels, 1)
+    plane = lambda channels, stages: decoders.TokenDecoder(channels, width, width, stages)
+    voxels = decoders.TokenDecoder(2, 2 * CONFIG.occupancy_channels, CONFIG.occupancy_channels, 1)
     for module, factor, usual, where, name, entry in (
             (plane(3, 2), 32, (10, 26), "decoders_image/", "rgb_decoder", "rgb"),
             (plane(4, 1), 16, (4, 64), "decoders_range_view/", "lidar_re", "lidar_reconstruction"),
@@ -78,8 +78,8 @@ def decoded(context: cases.Context) -> Checks:
         for scale, value in drawing.run(module, tokens, where=where).items():
             tolerance = STYLED_TOLERANCE if name == "voxel_decoder" else TOLERANCE
             yield cases.Check(f"{name}/{entry}_{scale}", drawing.channels_first(value), tolerance)
-    channels = heads.TABLE["birds_eye"].channels_of(CONFIG)
-    birds_eye = token_decoders.TokenDecoder(channels, width, width, 1, head=decoders.BirdsEyeHead)
+    channels = config_lib.BIRDS_EYE_CLASSES + decoders.INSTANCE_CHANNELS
+    birds_eye = decoders.TokenDecoder(channels, width, width, 1, head=decoders.BirdsEyeHead)
     # The file feeds the ground plan itself.
     grid = _grid(context, "bev_decoder/bev_segmentation_1", 16) or (12, 12)
     plan = drawing.channels_last(context.draw("bev_decoder_in", (1, FUSION.token_channels, *grid), "normal"))

@@ -27,6 +27,7 @@ from muvo_jax.config.parts import (
     BirdsEyeCamera,
     ConcatenationFusion,
     LastSeen,
+    Latent,
     PillarLidar,
     PlaneCamera,
     RangeViewLidar,
@@ -42,10 +43,10 @@ from muvo_jax.config.training import DataConfig, EvaluationConfig, OptimizerConf
 from muvo_jax.config.whole import Config
 from muvo_jax.geometry import BirdsEyeGrid, PillarGrid, RangeViewGeometry, RouteMap, VoxelGrid
 
-__all__ = ["BACKBONES", "BIRDS_EYE_CLASSES", "CAMERAS", "FLOW_LAGS", "FUSIONS",
-           "HEADS", "KNOWN_HEADS", "LATENTS", "LIDARS", "NO_SENSOR", "RATE_HZ", "ActionContract",
-           "AugmentationConfig", "AverageFusion", "BirdsEyeCamera", "BirdsEyeGrid", "ConcatenationFusion", "Config",
-           "DataConfig", "EvaluationConfig", "Kinematics", "LastSeen", "LossConfig", "ModelConfig", "OptimizerConfig",
-           "PillarGrid", "PillarLidar", "PlaneCamera", "RangeViewGeometry", "RangeViewLidar", "RouteMap",
-           "TokenLatent", "TrainConfig", "TrainingMean", "TransformerFusion", "VectorLatent", "VoxelGrid",
-           "ZeroGuess", "as_kind", "check_choice", "override", "override_all", "parse"]
+__all__ = ["BACKBONES", "BIRDS_EYE_CLASSES", "CAMERAS", "FLOW_LAGS", "FUSIONS", "HEADS", "KNOWN_HEADS", "LATENTS",
+           "LIDARS", "NO_SENSOR", "RATE_HZ", "ActionContract", "AugmentationConfig", "AverageFusion",
+           "BirdsEyeCamera", "BirdsEyeGrid", "ConcatenationFusion", "Config", "DataConfig", "EvaluationConfig",
+           "Kinematics", "LastSeen", "Latent", "LossConfig", "ModelConfig", "OptimizerConfig", "PillarGrid",
+           "PillarLidar", "PlaneCamera", "RangeViewGeometry", "RangeViewLidar", "RouteMap", "TokenLatent",
+           "TrainConfig", "TrainingMean", "TransformerFusion", "VectorLatent", "VoxelGrid", "ZeroGuess", "as_kind",
+           "check_choice", "override", "override_all", "parse"]

@@ -96,8 +96,7 @@ def _fit_model(model: config_lib.ModelConfig, description: schema.RecordingDescr
                          f"{lidar.columns}, and a pixel holds one return.")
     if description.voxels is not None and "occupancy" in heads:
         changes["voxels"] = description.voxels
-        if isinstance(model.latent, config_lib.VectorLatent):
-            changes["latent"] = _fit_voxel_decoder(model.latent, description.voxels, notes)
+        changes["latent"] = _fit_voxel_decoder(model.latent, description.voxels, notes)
     elif "occupancy" in heads:
         notes.append("no occupancy is recorded: the target is what each lidar scan hit and looked through, unknown "
                      "elsewhere.")
@@ -183,17 +182,27 @@ def _image_size(camera: schema.Camera, columns: int) -> tuple[int, int]:
     return rows // _SIDE_MULTIPLE * _SIDE_MULTIPLE, columns
 
 
-def _fit_voxel_decoder(latent: config_lib.VectorLatent, grid: config_lib.VoxelGrid,
-                       notes: list[str]) -> config_lib.VectorLatent:
-    """With the most full-width decoder stages, up to those it has, that halve down to whole voxels."""
-    for blocks in range(latent.occupancy_blocks, -1, -1):
-        if all(side % 2 ** (blocks + 3) == 0 for side in grid.shape):
-            if blocks != latent.occupancy_blocks:
-                notes.append(f"the voxel decoder has {blocks} full-width stages instead of {latent.occupancy_blocks}: "
-                             f"the recorded grid is only {_by(grid.shape)}.")
-            return dataclasses.replace(latent, occupancy_blocks=blocks)
-    raise schema.DataError(f"the recorded voxel grid of {_by(grid.shape)} does not suit the voxel decoder: each "
-                           f"side must be a multiple of 8. Record another grid, or leave the occupancy head out.")
+def _fit_voxel_decoder(latent: config_lib.Latent, grid: config_lib.VoxelGrid, notes: list[str]) -> config_lib.Latent:
+    """With the most full-width decoder stages, up to those it has, that halve down to whole voxels.
+
+    The 2D latent's voxel tokens fill the grid, so that its decoder keeps its stages.
+    """
+    suits = lambda stages: all(side % 2 ** (stages + 3) == 0 for side in grid.shape)
+    fewest = 0
+    if isinstance(latent, config_lib.TokenLatent):
+        fewest = latent.occupancy_token_stages
+        if suits(fewest):
+            return latent
+    else:
+        for stages in range(latent.occupancy_blocks, -1, -1):
+            if suits(stages):
+                if stages != latent.occupancy_blocks:
+                    notes.append(f"the voxel decoder has {stages} full-width stages instead of "
+                                 f"{latent.occupancy_blocks}: the recorded grid is only {_by(grid.shape)}.")
+                return dataclasses.replace(latent, occupancy_blocks=stages)
+    raise schema.DataError(f"the recorded voxel grid of {_by(grid.shape)} does not suit the voxel decoder: each side "
+                           f"must be a multiple of {2 ** (fewest + 3)}. Record another grid, or leave the occupancy "
+                           f"head out.")
 
 
 def _by(shape: tuple[int, ...]) -> str:

@@ -122,7 +122,7 @@ def test_a_collision_is_seen_where_the_car_will_be():
     assert wall(6.0) > 0.6  # 2.4 m on
     assert wall(1.0, (-1.0, 0.0)) < 0.1 and wall(0.0) < 0.1
     bend = rewards.poses_ahead(jnp.zeros(3), moment(5.0).before, moment(5.0, (0.0, -0.5)).after, 0.4)
-    np.testing.assert_allclose(bend[:, 2], 5.0 * np.array([0.0, 0.2, 0.4]) * np.tan(0.3) / 2.9, rtol=1e-3)
+    np.testing.assert_allclose(bend[:, 2], 5.0 * np.linspace(0.0, 0.4, len(bend)) * np.tan(0.3) / 2.9, rtol=1e-3)
     assert np.all(np.diff(bend[:, 1]) > 0)  # to the left
 
 
@@ -173,12 +173,13 @@ def test_without_a_painted_pixel_nothing_is_gained():
 
 
 def test_progress_fades_with_the_distance_from_the_route():
-    _, on = driven(through((0, 0), (20, 0)))
+    _, on = driven(through((0, LINE_Y_M), (20, LINE_Y_M)))
     np.testing.assert_allclose(on["progress_m"], 2.0, rtol=0.02)
     _, beside = driven(through((0, 2.6), (20, 2.6)))
     away = route.place(STRAIGHT, jnp.array([10.0, 2.6, 0.0]))[1]
     np.testing.assert_allclose(away, 2.6, atol=0.4)  # half a pixel
-    np.testing.assert_allclose(beside["progress_m"][2:], 2.0 * np.exp(-0.5 * (away / 2) ** 2), rtol=0.02)
+    fading = np.exp(-0.5 * (away / CONFIG.route_tolerance_m) ** 2)
+    np.testing.assert_allclose(beside["progress_m"][2:], 2.0 * fading, rtol=0.02)
 
 
 def test_driving_back_along_the_painted_route_loses_what_driving_on_gains():
@@ -207,9 +208,10 @@ def test_circling_earns_nothing(line):
 
 
 def test_leaving_and_rejoining_the_route_never_pays():
-    straight = driven(through((0, 0), (24, 0)))[1]["progress_m"].sum()
-    detour = driven(through((0, 0), (6, 0), (12, 6), (18, 0), (24, 0)))[1]["progress_m"].sum()
-    again = driven(through((0, 0), (12, 0), (12, 6), (4, 6), (4, 0), (24, 0)))[1]["progress_m"].sum()
+    y = LINE_Y_M
+    straight = driven(through((0, y), (24, y)))[1]["progress_m"].sum()
+    detour = driven(through((0, y), (6, y), (12, 6), (18, y), (24, y)))[1]["progress_m"].sum()
+    again = driven(through((0, y), (12, y), (12, 6), (4, 6), (4, y), (24, y)))[1]["progress_m"].sum()
     np.testing.assert_allclose(straight, 24.0, atol=0.5)
     assert detour < 0.8 * straight and again < straight
 

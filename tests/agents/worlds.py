@@ -49,11 +49,11 @@ class WallModel(world_model.WorldModel):
 
     def encode(self, variables, batch, *, train=False, keys=None, axis_name=None):
         seen = jnp.stack([batch.range_view[..., 3].mean(axis=(-2, -1)), batch.speed_mps], axis=-1)
-        return _padded(seen, self.config.embedding_channels), {}
+        return _padded(seen, self.config.latent.embedding_channels), {}
 
     def observe_step(self, variables, noise, state, action, embedding, is_first):
         posterior = Gaussian(jnp.zeros_like(state.stochastic), jnp.ones_like(state.stochastic))
-        deterministic = _padded(embedding[..., :2], self.config.deterministic_channels)
+        deterministic = _padded(embedding[..., :2], self.config.latent.deterministic_channels)
         return LatentState(deterministic, posterior.mean), (posterior, posterior)
 
     def imagine_step(self, variables, noise, state, action):
@@ -61,7 +61,7 @@ class WallModel(world_model.WorldModel):
         gap_m, speed_mps = state.deterministic[..., 0], state.deterministic[..., 1]
         speed_mps = jnp.maximum(speed_mps + action[..., 0], 0.0)
         following = jnp.stack([gap_m - 0.2 * speed_mps, speed_mps], axis=-1)
-        return LatentState(_padded(following, self.config.deterministic_channels), prior.mean), prior
+        return LatentState(_padded(following, self.config.latent.deterministic_channels), prior.mean), prior
 
     def decode(self, variables, states, heads=None, memory=None, rows=None):
         """Sure of what is occupied: everything from the wall on."""

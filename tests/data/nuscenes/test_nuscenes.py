@@ -216,7 +216,7 @@ def test_a_sensor_may_be_missing_altogether(root, sensor, modality):
     assert [recording.description.lidar is None, recording.description.camera is None] == [modality == "points_m",
                                                                                              modality == "image"]
     model = fitting.adapt(presets.get("tiny"), recording).config.model
-    assert (model.camera == "none", model.lidar == "none") == (modality == "image", modality == "points_m")
+    assert (model.camera is None, model.lidar is None) == (modality == "image", modality == "points_m")
 
 
 def test_a_camera_that_was_not_unpacked_is_named(root):

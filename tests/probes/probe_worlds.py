@@ -99,7 +99,7 @@ class Wall:
 
     def lidar(self, memory):
         del memory
-        return "rv"
+        return config_lib.RangeViewLidar()
 
     def starts(self, generator, count):
         return generator.uniform(30.0, 45.0, count)

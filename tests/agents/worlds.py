@@ -67,7 +67,8 @@ class WallModel(world_model.WorldModel):
         """Sure of what is occupied: everything from the wall on."""
         grid, gap_m = self.config.voxels, states.features[..., 0]
         ahead_m = grid.origin_m[0] + grid.voxel_size_m * (np.arange(grid.shape[0]) + 0.5)
-        wall = 20.0 * (jnp.asarray(ahead_m, jnp.float32) - jnp.expand_dims(gap_m, -1))
+        ahead_m = jnp.asarray(ahead_m, jnp.float32).reshape((1,) * gap_m.ndim + (-1,))
+        wall = 20.0 * (ahead_m - jnp.expand_dims(gap_m, -1))
         wall = jnp.broadcast_to(jnp.expand_dims(wall, (-2, -1)), (*gap_m.shape, *grid.shape))
         return Predictions({"occupancy": {1: jnp.stack([jnp.zeros_like(wall), wall], axis=-1)}})
 

@@ -47,6 +47,12 @@ class VoxelGrid:
     def __post_init__(self):
         check(self)
 
+    def layers(self, low_m: float, high_m: float = math.inf) -> slice:
+        """Those of the last axis whose lower faces lie from `low_m` on and below `high_m` over the ground."""
+        lower_m = [self.origin_m[2] + self.voxel_size_m * layer for layer in range(self.shape[2])]
+        start, stop = (sum(face_m < limit_m - 1e-6 for face_m in lower_m) for limit_m in (low_m, high_m))
+        return slice(start, stop)
+
 
 @dataclasses.dataclass(frozen=True)
 class PillarGrid:

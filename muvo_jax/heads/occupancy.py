@@ -104,15 +104,14 @@ def _see(seen: glimpse.VoxelGlimpse, config: ModelConfig) -> types.Array:
 
 
 def _compose(raw, seen: glimpse.VoxelGlimpse, mean, config: ModelConfig) -> dict[int, types.Array]:
-    grid = config.voxels
-    heights = grid.origin_m[2] + grid.voxel_size_m * jnp.arange(grid.shape[2], dtype=jnp.float32)
-    trust = jnp.where(heights >= occupancy.ABOVE_ROAD_M - 1e-3, _TRUST, 0.0).reshape(1, 1, 1, -1)
+    trust = np.zeros(config.voxels.shape[2], np.float32)
+    trust[occupancy.above_road(config.voxels)] = _TRUST
     # Above the road only: the road's rings do not move with the world. The newest scan has the say; the older ones
     # where it has none. (Added up, what moves is cancelled out.)
     evidence = seen.newest + (1.0 - jnp.abs(seen.newest)) * seen.older
     if seen.onward is not None:  # where it was may be hidden by it now, or not: that is left to be learned
         evidence = jnp.maximum(evidence, seen.onward)
-    believed = trust * evidence
+    believed = jnp.asarray(trust).reshape(1, 1, 1, -1) * evidence
     raw = {scale: value.reshape(*value.shape[:3], -1, 2) for scale, value in raw.items()}
     own, result = mean(raw), {}
     for scale in head.SCALES:

@@ -18,7 +18,6 @@ from muvo_jax.metrics import streaming
 
 VARIANTS = {"observed": False, "all": True}  # name -> whether unknown voxels count as empty
 ABOVE_ROAD_M = 0.5
-_TOLERANCE_M = 1e-6
 
 
 def above_road(grid: config_lib.VoxelGrid) -> slice:
@@ -26,8 +25,7 @@ def above_road(grid: config_lib.VoxelGrid) -> slice:
 
     Of the town's 1 m voxels from z = -1.5 m on these are all but the lowest two: the road lies in the second.
     """
-    lower_m = grid.origin_m[2] + grid.voxel_size_m * np.arange(grid.shape[2])
-    return slice(int((lower_m < ABOVE_ROAD_M - _TOLERANCE_M).sum()), None)
+    return grid.layers(ABOVE_ROAD_M)
 
 
 def counts(occupied: np.ndarray, target: np.ndarray, *, unknown_is_empty: bool,

@@ -7,7 +7,6 @@ observed sees what was there before, an imagined one everything.
 from __future__ import annotations
 
 import dataclasses
-import math
 
 import flax.struct
 import jax
@@ -228,8 +227,7 @@ def _gathered(evidence: Array) -> VoxelGlimpse:
 
 def _onward(memory: Memory, sight: Sight, evidence: Array, hits: Array, ahead: Array, grid: VoxelGrid) -> Array:
     """1 where returns of the newest scan will be that go on as they moved: [n, S, X, Y, Z], `ahead` [n, S] steps."""
-    layer = lambda height_m: max(0, math.ceil((height_m - grid.origin_m[2]) / grid.voxel_size_m - 1e-3))
-    layers = slice(layer(_MOVING_M[0]), layer(_MOVING_M[1]))
+    layers = grid.layers(*_MOVING_M)
     older = evidence[:, -1 - scene_flow.LAGS:-1]
     flow = scene_flow.cell_flow(*jax.lax.stop_gradient((hits[:, -1, ..., layers], older[..., layers])))
     _, points_m, valid = _scans(memory, sight)

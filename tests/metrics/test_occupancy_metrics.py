@@ -64,7 +64,8 @@ def test_counts_are_summed_before_the_ratio_and_kept_per_step():
                                                            (0.6, 1.0, 0), (-1.4, 0.1, 19)])
 def test_above_the_road_are_the_layers_that_lie_wholly_half_a_metre_over_it(origin_m, size_m, first):
     grid = config_lib.VoxelGrid((8, 8, 40), size_m, (-4.0, -4.0, origin_m))
-    assert occupancy.above_road(grid) == slice(first, None)
+    assert occupancy.above_road(grid) == slice(first, 40)
+    assert grid.layers(-100.0, 0.5) == slice(0, first)
 
 
 @pytest.mark.parametrize(("above", "called"), [(0.5, [False, True, False]), (0.3, [True, True, True]),

@@ -7,7 +7,7 @@ payloads out of the file together.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -90,3 +90,64 @@ class Template(NamedTuple):
             return standins.Repeats([str(payload, "utf-8", "surrogatepass") for payload in payloads])
         array = self.value.values
         return standins.Repeats(payloads.view(array.dtype).reshape(count, *array.shape))
+
+
+class Items:
+    """A list whose items are being read: the stack that they gather on, and for each value on it where it began: its
+    offset in the file and the number of its first entry of the memo."""
+
+    def __init__(self, stack: list):
+        self.stack = stack
+        self.begins: list[tuple[int, int]] = []
+
+    def take_apart(self, operands: int) -> None:
+        """Makes single values of items that were read together and turn out to be operands, not items."""
+        for place in range(len(self.stack) - 1, max(len(self.stack) - operands, 0) - 1, -1):
+            if isinstance(self.stack[place], standins.Repeats):
+                singles = self.stack[place].singles()
+                self.stack[place:place + 1] = singles
+                self.begins[place:place + 1] = self.begins[place:place + 1] * len(singles)
+
+    def note(self, offset: int, memo: int) -> None:
+        """After the opcode at `offset`, before which the memo had so many entries."""
+        del self.begins[len(self.stack):]
+        if len(self.stack) > len(self.begins):
+            self.begins.append((offset, memo))
+
+
+class Skipped(NamedTuple):
+    """Items that were read together: their first entry of the memo, how many each would have made, how many items
+    there are, and where they lie."""
+
+    memo: int
+    memos: int
+    items: int
+    offset: int
+    size: int
+
+
+class Memo(dict):
+    """What opcodes refer to by number; entries of items that were read together are made when they are asked for."""
+
+    def __init__(self, entry: Callable[[int], Any], first: int):
+        """Args:
+          entry: makes the entry of a number that is missing.
+          first: the number of the first one.
+        """
+        super().__init__()
+        self._entry, self._first = entry, first
+        self.skipped: list[Skipped] = []
+        self._of_skipped = 0
+
+    @property
+    def next(self) -> int:
+        """The number of the next entry."""
+        return self._first + len(self) + self._of_skipped
+
+    def skip(self, skipped: Skipped) -> None:
+        if skipped.memos:
+            self.skipped.append(skipped)
+            self._of_skipped += skipped.memos * skipped.items
+
+    def __missing__(self, number: int) -> Any:
+        return self._entry(number)

@@ -13,7 +13,7 @@ import io
 import pathlib
 import pickle
 from collections.abc import Callable, Sequence
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -107,63 +107,6 @@ def _content(path: pathlib.Path, what: str) -> bytes:
 _Python: Any = pickle._Unpickler  # only in the Python form can opcodes be taken away
 
 
-class _List:
-    """A list whose items are being read: the stack that they gather on, and for each value on it where it began: its
-    offset in the file and the number of its first entry of the memo."""
-
-    def __init__(self, stack: list):
-        self.stack = stack
-        self.begins: list[tuple[int, int]] = []
-
-    def take_apart(self, operands: int) -> None:
-        """Makes single values of items that were read together and turn out to be operands, not items."""
-        for place in range(len(self.stack) - 1, max(len(self.stack) - operands, 0) - 1, -1):
-            if isinstance(self.stack[place], standins.Repeats):
-                singles = self.stack[place].singles()
-                self.stack[place:place + 1] = singles
-                self.begins[place:place + 1] = self.begins[place:place + 1] * len(singles)
-
-    def note(self, offset: int, memo: int) -> None:
-        """After the opcode at `offset`, before which the memo had so many entries."""
-        del self.begins[len(self.stack):]
-        if len(self.stack) > len(self.begins):
-            self.begins.append((offset, memo))
-
-
-class _Skipped(NamedTuple):
-    """Items that were read together: their first entry of the memo, how many each would have made, how many items
-    there are, and where they lie."""
-
-    memo: int
-    memos: int
-    items: int
-    offset: int
-    size: int
-
-
-class _Memo(dict):
-    """What opcodes refer to by number; entries of items that were read together are made when they are asked for."""
-
-    def __init__(self, unpickler: _Unpickler, first: int):
-        super().__init__()
-        self._unpickler, self._first = unpickler, first
-        self.skipped: list[_Skipped] = []
-        self._of_skipped = 0
-
-    @property
-    def next(self) -> int:
-        """The number of the next entry."""
-        return self._first + len(self) + self._of_skipped
-
-    def skip(self, skipped: _Skipped) -> None:
-        if skipped.memos:
-            self.skipped.append(skipped)
-            self._of_skipped += skipped.memos * skipped.items
-
-    def __missing__(self, number: int) -> Any:
-        return self._unpickler.entry(number)
-
-
 class _Unpickler(_Python):
     dispatch: ClassVar[dict[int, Callable]] = {code: work for code, work in _Python.dispatch.items()
                                                if bytes([code]) in _OPCODES}
@@ -181,9 +124,9 @@ class _Unpickler(_Python):
         self.stack: list = []
         self.proto = 0
         self.append = self.stack.append
-        self.memo = _Memo(self, first)
+        self.memo = repeats.Memo(self.entry, first)
         self._outer = outer
-        self._lists: list[_List] = []
+        self._lists: list[repeats.Items] = []
         self._template: repeats.Template | None = None
         self._payloads: collections.deque[repeats.Payload] = collections.deque(maxlen=_PAYLOADS)
         self._made_anew: dict[int, Any] = {}
@@ -214,7 +157,7 @@ class _Unpickler(_Python):
     def _watch(self, code: int, offset: int, memo: int) -> None:
         """Keeps track of which bytes made which item of a list."""
         if code == pickle.MARK[0] and self.metastack[-1] and isinstance(self.metastack[-1][-1], list):
-            self._lists.append(_List(self.stack))
+            self._lists.append(repeats.Items(self.stack))
             self._payloads.clear()
             return
         while len(self._lists) > 1 and self._lists[-2].stack is self.stack:
@@ -233,7 +176,7 @@ class _Unpickler(_Python):
         if copies is None or self._template is None:
             return False
         size = self._template.size
-        self.memo.skip(_Skipped(self.memo.next, self._template.memos, len(copies), offset, size))
+        self.memo.skip(repeats.Skipped(self.memo.next, self._template.memos, len(copies), offset, size))
         self._seek(offset + len(copies) * size)
         self.append(copies)
         begins.append((offset, self.memo.next))

@@ -7,8 +7,12 @@ with all older evidence. Nothing is learned, and nothing is differentiable.
 
 from __future__ import annotations
 
+import functools
+import operator
+
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from muvo_jax.config import FLOW_LAGS as LAGS
 from muvo_jax.types import Array
@@ -34,20 +38,21 @@ def cell_flow(hits: Array, older: Array) -> Array:
       float32 [N, X, Y, 2], cells of the grid along x and y; 0 where nothing moves.
     """
     farthest = LAGS * REACH_CELLS  # displacements are tried to the cell over all lags, and taken evenly between them
-    sides = jnp.arange(-farthest, farthest + 1)
-    moves = jnp.stack(jnp.meshgrid(sides, sides, indexing="ij"), axis=-1).reshape(-1, 2)
+    sides = np.arange(-farthest, farthest + 1)
+    moves = jnp.asarray(np.stack(np.meshgrid(sides, sides, indexing="ij"), axis=-1).reshape(-1, 2))
+    starts = (farthest - np.round(sides[:, None] * (np.arange(1, LAGS + 1) / LAGS))).astype(np.int32)  # in `room`
     room = jnp.pad(older, ((0, 0), (0, 0), (farthest, farthest), (farthest, farthest), (0, 0)))
-    size = (hits.shape[0], *hits.shape[1:])
+    rows, columns = hits.shape[1:3]
 
-    def agreement(move):
-        found = jnp.zeros(hits.shape[:3], jnp.float32)
-        for lag in range(1, LAGS + 1):
-            x, y = (farthest - jnp.round(move[axis] * (lag / LAGS)).astype(jnp.int32) for axis in (0, 1))
-            there = jax.lax.dynamic_slice(room[:, LAGS - lag], (0, x, y, 0), size)
-            found = found + (hits * there).sum(axis=-1) / LAGS
-        return _block(found)
+    def agreements_along(starts_x: Array) -> Array:
+        """With all moves along y at once, whose slices are static: half the time of one move after the other."""
+        strips = [jax.lax.dynamic_slice_in_dim(room[:, LAGS - lag], starts_x[lag - 1], rows, axis=1)
+                  for lag in range(1, LAGS + 1)]
+        return jnp.stack([_block(functools.reduce(operator.add, (
+            (hits * strip[:, :, start:start + columns]).sum(axis=-1) / LAGS
+            for strip, start in zip(strips, starts_y, strict=True)))) for starts_y in starts.tolist()])
 
-    agreements = jax.lax.map(agreement, moves)
+    agreements = jax.lax.map(agreements_along, jnp.asarray(starts)).reshape(-1, *hits.shape[:3])
     standing = agreements[moves.shape[0] // 2]
     # Of moves that agree alike the shortest is taken.
     best = (agreements - 0.05 * jnp.linalg.norm(moves.astype(jnp.float32), axis=-1)[:, None, None, None]).argmax(axis=0)
@@ -61,5 +66,5 @@ def _block(values: Array) -> Array:
     half = WINDOW_CELLS // 2
     wide = jnp.pad(values, ((0, 0), (half, half), (half, half)))
     x, y = values.shape[1:]
-    across = jnp.stack([wide[:, place:place + x] for place in range(WINDOW_CELLS)]).sum(axis=0)
-    return jnp.stack([across[:, :, place:place + y] for place in range(WINDOW_CELLS)]).sum(axis=0)
+    across = functools.reduce(operator.add, (wide[:, place:place + x] for place in range(WINDOW_CELLS)))
+    return functools.reduce(operator.add, (across[:, :, place:place + y] for place in range(WINDOW_CELLS)))

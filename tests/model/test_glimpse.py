@@ -8,7 +8,9 @@ import numpy as np
 import pytest
 
 from muvo_jax import config as config_lib
-from muvo_jax import presets
+from muvo_jax import head, presets
+from muvo_jax.heads import image as image_head
+from muvo_jax.heads import range_view as range_view_head
 from muvo_jax.model import glimpse, memory
 from muvo_jax.ops import range_view, reproject
 from muvo_jax.types import Memory, Motion, Vantage
@@ -105,3 +107,36 @@ def test_too_few_remembered_frames_to_tell_what_moves_are_refused():
     with pytest.raises(ValueError, match="memory_frames is 3; set it to 4 or more"):
         config_lib.LastSeen(memory_frames=3, follow_movers=True)
     assert memory.guessed_heads(CONFIG) == ("range_view", "occupancy")
+
+
+def test_points_off_their_beams_are_decoded_where_they_came_to():
+    """With nothing drawn: the point of the beam at the moved range, and what the return lay beside it."""
+    shape = (1, VIEW.rows, VIEW.columns)
+    ranges_m = jnp.full(shape, 12.0)
+    beside_m = jnp.full((*shape, 3), 0.3).at[:, ::2].set(0.0)
+    seen = glimpse.RangeGlimpse(moved_m=ranges_m, newest_m=ranges_m, still_m=ranges_m, filled_m=ranges_m,
+                                sky=jnp.zeros(shape), height_m=jnp.zeros(shape), off_beam_m=beside_m)
+    drawn = {scale: jnp.zeros((1, VIEW.rows // scale, VIEW.columns // scale, 5)) for scale in head.SCALES}
+    config = dataclasses.replace(CONFIG, range_view_points="beams")
+    composed = range_view_head.HEAD.guide.compose(drawn, seen, lambda outputs: outputs, config)
+    for scale, value in composed.items():
+        points_m = range_view_head.HEAD.finish(value, scale, config)
+        want = (reproject.beam_points(ranges_m, VIEW) + beside_m)[:, ::scale, ::scale]
+        np.testing.assert_allclose(points_m[..., :3], want, atol=1e-3)
+        np.testing.assert_allclose(points_m[..., 3], 12.0, rtol=1e-5)
+
+
+def test_what_comes_into_view_is_guessed_in_the_light_of_what_was_seen():
+    """At night: a pixel that was seen stays, one beyond the edge is half the edge and half the darkened average."""
+    average, night = 0.5, 0.1
+    covered = jnp.array([1.0, glimpse.EDGE]).reshape(1, 1, 2, 1)
+    covered = jnp.tile(covered, (1, 4, 2, 1))
+    seen = glimpse.ImageGlimpse(image=night * jnp.tile(covered, (1, 1, 1, 3)), covered=covered,
+                                colour=jnp.full((1, 1, 1, 3), night))
+    nothing = glimpse.ImageGlimpse(*(jnp.zeros_like(leaf) for leaf in (seen.image, covered, seen.colour)))
+    drawn = {scale: jnp.zeros((1, 4 // scale, 4 // scale, 3)) for scale in head.SCALES}
+    usual = lambda outputs: jax.tree.map(lambda leaf: leaf + average, outputs)
+    compose = lambda one: image_head.HEAD.guide.compose(drawn, one, usual, CONFIG)
+    for scale in head.SCALES:
+        np.testing.assert_allclose(compose(seen)[scale], night, atol=1e-6)  # nowhere daylight
+        np.testing.assert_allclose(compose(nothing)[scale], average, atol=1e-6)

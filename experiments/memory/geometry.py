@@ -14,11 +14,14 @@ import numpy as np
 
 import muvo_jax
 from muvo_jax import config as config_lib
-from muvo_jax.data import pipeline, sources
+from muvo_jax import recordings
+from muvo_jax.data import pipeline
 from muvo_jax.metrics import occupancy
 from muvo_jax.model import glimpse
 from muvo_jax.ops import motion, reproject
 from muvo_jax.types import Batch
+
+MOVED = "what moved and goes on, alone"
 
 
 def sights(run, batch: Batch):
@@ -58,6 +61,7 @@ def voxels(run, batch: Batch) -> dict[str, jax.Array]:
              "the newest scan first": first}
     if shown.onward is not None:
         rules["and what moved goes on"] = jnp.maximum(first, shown.onward)
+        rules[MOVED] = shown.onward
     return {name: value > 0.0 for name, value in rules.items()}
 
 
@@ -82,7 +86,7 @@ def images(run, batch: Batch) -> dict[str, jax.Array]:
 def main(path: str) -> None:
     run = muvo_jax.load(path)
     config = run.config
-    recording = sources.open_configured(config)
+    recording = recordings.open_configured(config)
     frames, above = pipeline.Frames(recording, config), occupancy.above_road(config.model.voxels)
     guesses = jax.jit(lambda batch: (voxels(run, batch), images(run, batch)))
     for split in (name for name in recording.description.splits if name != "train"):
@@ -105,7 +109,8 @@ def main(path: str) -> None:
                 error = np.clip(value, 0, 1).reshape(truth.image.shape) - np.asarray(truth.image) / 255.0
                 decibels.setdefault(fill, []).append(-10.0 * np.log10(np.square(error).mean(axis=(2, 3, 4))))
         for (rule, name), sums in counts.items():
-            print(f"{split}  IoU+ {name}  {occupancy.SCORES['iou_occ'](sums):.3f}  {rule}")
+            score = "precision" if rule == MOVED else "iou_occ"
+            print(f"{split}  {score} {name}  {occupancy.SCORES[score](sums):.3f}  {rule}")
         for fill, values in decibels.items():
             print(f"{split}  PSNR  {np.concatenate(values).mean():.2f} dB  {fill}")
 

@@ -9,7 +9,8 @@ import jax
 import numpy as np
 
 import muvo_jax
-from muvo_jax.data import pipeline, sources
+from muvo_jax import recordings
+from muvo_jax.data import pipeline
 from muvo_jax.metrics import occupancy
 
 ABOVE = (0.2, 0.25, 0.3, 0.35, 0.4, 0.45, 0.5)
@@ -19,7 +20,7 @@ def main(path: str) -> None:
     run = muvo_jax.load(path)
     config, model = run.config, run.model
     context, horizon = config.data.context, config.data.horizon
-    frames = pipeline.Frames(sources.open_configured(config), config)
+    frames = pipeline.Frames(recordings.open_configured(config), config)
     above = occupancy.above_road(config.model.voxels)
 
     @jax.jit

@@ -40,17 +40,24 @@ def cell_flow(hits: Array, older: Array) -> Array:
     farthest = LAGS * REACH_CELLS  # displacements are tried to the cell over all lags, and taken evenly between them
     sides = np.arange(-farthest, farthest + 1)
     moves = jnp.asarray(np.stack(np.meshgrid(sides, sides, indexing="ij"), axis=-1).reshape(-1, 2))
-    starts = (farthest - np.round(sides[:, None] * (np.arange(1, LAGS + 1) / LAGS))).astype(np.int32)  # in `room`
-    room = jnp.pad(older, ((0, 0), (0, 0), (farthest, farthest), (farthest, farthest), (0, 0)))
+    starts = (farthest - np.round(sides[:, None] * (np.arange(1, LAGS + 1) / LAGS))).astype(np.int32)  # in `room`, by lag
+    # Layers and lags first, cells along y last: the loops below then run over whole rows of cells.
+    layers = jnp.moveaxis(hits, -1, 0)
+    room = ((0, 0), (0, 0), (farthest, farthest), (farthest, farthest), (0, 0))
+    room = jnp.moveaxis(jnp.pad(older, room), (1, -1), (0, 1))
     rows, columns = hits.shape[1:3]
 
     def agreements_along(starts_x: Array) -> Array:
-        """With all moves along y at once, whose slices are static: half the time of one move after the other."""
-        strips = [jax.lax.dynamic_slice_in_dim(room[:, LAGS - lag], starts_x[lag - 1], rows, axis=1)
+        """With all moves along y at once, whose slices are static, and each of which several moves share."""
+        strips = [jax.lax.dynamic_slice_in_dim(room[LAGS - lag], starts_x[lag - 1], rows, axis=2)
                   for lag in range(1, LAGS + 1)]
-        return jnp.stack([_block(functools.reduce(operator.add, (
-            (hits * strip[:, :, start:start + columns]).sum(axis=-1) / LAGS
-            for strip, start in zip(strips, starts_y, strict=True)))) for starts_y in starts.tolist()])
+        matches: dict[tuple[int, int], Array] = {}
+        for lag, start in sorted({place for starts_y in starts.tolist()
+                                  for place in enumerate(starts_y)}):
+            moved = strips[lag][..., start:start + columns]
+            matches[lag, start] = functools.reduce(operator.add, layers * moved) / LAGS
+        return jnp.stack([_block(functools.reduce(operator.add, (matches[place] for place in enumerate(starts_y))))
+                          for starts_y in starts.tolist()])
 
     agreements = jax.lax.map(agreements_along, jnp.asarray(starts)).reshape(-1, *hits.shape[:3])
     standing = agreements[moves.shape[0] // 2]

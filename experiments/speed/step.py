@@ -1,0 +1,185 @@
+"""Where a training step's time goes: python experiments/speed/step.py [--preset=town] [--set KEY=VALUE ...]
+
+A row for each part of the step, forward and with its gradients: processor seconds, the arithmetic of its matrix
+products and convolutions, and its share of what a float32 product of 2048x2048 reaches in the same run. Random frames
+of the preset's sizes, fresh weights.
+"""
+
+import argparse
+import dataclasses
+import json
+import math
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import timing
+from jax.extend import core
+
+import muvo_jax
+from muvo_jax import config as config_lib
+from muvo_jax import head as head_lib
+from muvo_jax import presets
+from muvo_jax.model import glimpse, rollout, world_model
+from muvo_jax.model import memory as memory_lib
+from muvo_jax.objectives import kl
+from muvo_jax.ops import camera, range_view
+from muvo_jax.training import optimizer, state, step
+from muvo_jax.types import Batch
+
+GEMM = 2048
+
+
+def operations(function, *arguments) -> float:
+    """Of all products and convolutions in a function, loops counted as often as they run."""
+    return _operations(jax.make_jaxpr(function)(*arguments).jaxpr)
+
+
+def _operations(jaxpr) -> float:
+    total = 0.0
+    for equation in jaxpr.eqns:
+        if equation.primitive.name == "dot_general":
+            (contracted, _), _ = equation.params["dimension_numbers"]
+            sides = equation.invars[0].aval.shape
+            total += 2.0 * math.prod(equation.outvars[0].aval.shape) * math.prod(sides[axis] for axis in contracted)
+        elif equation.primitive.name == "conv_general_dilated":
+            kernel = equation.invars[1].aval.shape
+            outputs = kernel[equation.params["dimension_numbers"].rhs_spec[0]]
+            total += 2.0 * math.prod(equation.outvars[0].aval.shape) * math.prod(kernel) / outputs
+        elif equation.primitive.name == "cond":  # branches for platforms
+            total += max(_operations(branch.jaxpr) for branch in equation.params["branches"])
+        else:
+            times = equation.params.get("length", 1) if equation.primitive.name == "scan" else 1
+            total += times * sum(_operations(inner) for inner in core.jaxprs_in_params(equation.params))
+    return total
+
+
+def random_batch(config: config_lib.Config) -> Batch:
+    """Windows as long as training's of the sizes of a config with camera, range view, route and occupancy."""
+    random, model, view = np.random.default_rng(0), config.model, config.model.range_view
+    lead = (config.train.batch, config.data.frames)
+    beams = range_view.beam_directions(view)
+    road_m = view.position_m[2] / np.maximum(-beams[..., 2], 1e-3)
+    range_m = np.minimum(20.0, road_m) * random.uniform(0.9, 1.0, (*lead, 1, 1))
+    scan = np.concatenate([beams * range_m[..., None] + view.position_m, range_m[..., None]], -1).astype(np.float32)
+    intrinsics = camera.intrinsics_from_fov(model.image_size[1], model.image_size[0], 1.4)
+    return Batch(action=random.uniform(-1, 1, (*lead, 2)).astype(np.float32),
+                 is_first=np.broadcast_to(np.arange(lead[1]) == 0, lead),
+                 image=random.integers(0, 256, (*lead, *model.image_size, 3), np.uint8), range_view=scan,
+                 occupancy=random.choice(np.array([0, 0, 0, 1, 255], np.uint8), (*lead, *model.voxels.shape)),
+                 route_map=np.zeros((*lead, *world_model.ROUTE_MAP_SIZE), np.uint8),
+                 speed_mps=np.full(lead, 8.0, np.float32), intrinsics=np.stack([intrinsics] * lead[0]),
+                 camera_to_ego=np.stack([camera.level_camera_to_ego((1.0, 0.0, 1.8))] * lead[0]))
+
+
+def parts(config: config_lib.Config, batch: Batch) -> dict[str, tuple]:
+    """Part -> (function, arguments, of which the first are differentiated)."""
+    model, network = muvo_jax.WorldModel(config.model), world_model.Network(config.model)
+    variables = jax.tree.map(jnp.asarray, model.init(jax.random.key(0)))
+    params, rest = variables["params"], variables["batch_stats"]
+    join = lambda own: {"params": params | own, "batch_stats": rest}
+    of = lambda *names: {name: params[name] for name in names if name in params}
+    keys = jax.random.split(jax.random.key(1), batch.batch_size)
+    seen = min(config.train.observe_frames or batch.frames, batch.frames)
+    shown = batch.time_slice(0, seen)
+    frames = jax.tree.map(jnp.asarray, model._frames(shown))
+    mode = world_model.norm.Mode(True)
+    during = lambda own, method, *inputs: network.apply(
+        join(own), *inputs, method=method, mutable=["batch_stats"])[0]
+    camera_of = lambda own: during(own, lambda module, frames: module.camera(frames, mode), frames)
+    lidar_of = lambda own: during(own, lambda module, frames: module.lidar(frames, mode), frames)
+    maps = jax.jit(lambda: (camera_of({}), lidar_of({})))()
+    measured = lambda module: [module.route(frames["route_map"], mode)] + (
+        [module.speed(frames["speed_mps"])] if config.model.speed else [])
+    fused = lambda own, maps: during(own, lambda module, maps: module.fusion(*maps, measured(module), mode, None), maps)
+    embedding = jax.jit(fused)({}, maps)
+    embedding = embedding.reshape(*shown.action.shape[:2], *embedding.shape[1:])
+    noise = rollout.draw_noise(keys, seen, model.initial_state(1).stochastic.shape[1:], dropout=True)
+    filtered = lambda own, embedding: rollout.filter_embeddings(
+        model, join(own), embedding, shown.action, shown.is_first, noise,
+        jnp.asarray(shown.speed_mps) if config.model.tracks_motion else None)
+    observed, _ = jax.jit(lambda: rollout.observe_window(model, variables, shown, keys, train=True))()
+    rows = {"camera encoder": (camera_of, (of("camera"),), ()), "lidar encoder": (lidar_of, (of("lidar"),), ()),
+            "route, speed and fusion": (fused, (of("fusion", "route", "speed"), maps), ()),
+            "filter": (filtered, (of("transition"), embedding), ())}
+    if seen < batch.frames:
+        rows["imagining"] = (lambda own, last: rollout.imagine(model, join(own), keys, last, jnp.asarray(
+            batch.action)[:, seen - 1:-1]).states.features, (of("transition"), observed.last), ())
+    states = jax.jit(lambda: step._and_imagined(model, variables, observed, batch.action, keys))()
+    states, target = step._some_frames(states, batch, keys, config.train.decode_frames)
+    flat = lambda tree: jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), tree)
+    places = jnp.repeat(jnp.arange(batch.batch_size), target.frames)
+    for head in config.model.heads:
+        own = of(f"decoders_{head}")
+        if head in memory_lib.guessed_heads(config.model):
+            rows[f"{head}: what the memory shows"] = (
+                lambda pose, head=head: glimpse.look(config.model, observed.memory, places, dataclasses.replace(
+                    flat(states.vantage), motion=dataclasses.replace(flat(states.vantage).motion, pose=pose)),
+                    (head,)), (flat(states.vantage).motion.pose,), ())
+        decode = lambda own, features, head=head: model.decode(
+            join(own), dataclasses.replace(states, deterministic=features), (head,), observed.memory)
+        rows[f"{head}: decoder"] = (decode, (own, states.deterministic), ())
+        predictions = jax.jit(decode)(own, states.deterministic).scales(head)
+        rows[f"{head}: losses"] = (
+            lambda predictions, head=head: [value.terms(name) for name, value in head_lib.get(head).losses(
+                head_lib.Learned(predictions, target, config.model, config.loss, keys, None)).items()],
+            (predictions,), ())
+    rows["KL divergence"] = (lambda posterior, prior: kl.balanced_kl_sums(
+        posterior, prior, balance=config.loss.kl_balance, numerics=config.model.numerics).terms("kl"),
+        (observed.posterior, observed.prior), ())
+    return rows
+
+
+def both_ways(function):
+    """The function with the gradients of its differentiable arguments, its own results standing for those behind it."""
+    def run(*arguments):
+        results, pull = jax.vjp(lambda *inputs: [leaf for leaf in jax.tree.leaves(function(*inputs)) if jnp.issubdtype(
+            leaf.dtype, jnp.floating)], *arguments)
+        return pull(results)
+
+    return run
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--preset", default="town")
+    parser.add_argument("--set", nargs="*", default=[], metavar="KEY=VALUE")
+    parser.add_argument("--rounds", type=int, default=3)
+    options = parser.parse_args()
+    chosen = dict(setting.split("=", 1) for setting in options.set)
+    config = config_lib.override_all(presets.get(options.preset), {
+        name: json.loads(value) if value[:1] in "0123456789tf[" else value for name, value in chosen.items()})
+    batch = random_batch(config)
+    matrix = jax.random.normal(jax.random.key(0), (GEMM, GEMM))
+    product = jax.jit(lambda matrix: matrix @ matrix)
+    gemm_s = min(timing.processor_seconds({"product": lambda: product(matrix)}, 10)["product"])
+    peak = 2.0 * GEMM**3 / gemm_s
+    print(f"float32 product of {GEMM}x{GEMM}: {peak / 1e9:.0f} GFLOP a processor second\n")
+    print("| part | forward (s) | with gradients (s) | arithmetic (GFLOP) | share of the product's speed |")
+    print("|---|---:|---:|---:|---:|")
+    for name, (function, arguments, _) in parts(config, batch).items():
+        forward, whole = jax.jit(function), jax.jit(both_ways(function))
+        taken = timing.processor_seconds({"forward": lambda run=forward, given=arguments: run(*given),
+                                          "whole": lambda run=whole, given=arguments: run(*given)}, options.rounds)
+        row(name, min(taken["forward"]), min(taken["whole"]), operations(both_ways(function), *arguments), peak)
+    model = muvo_jax.WorldModel(config.model)
+    fresh = lambda: state.create(model.init(jax.random.key(0)), optimizer.make_optimizer(
+        config.optimizer, config.train.steps), jax.random.key(1))
+    train, held = step.make_train_step(model, config), [fresh()]
+    placed = train.place(batch)
+
+    def update():
+        held[0], metrics = train(held[0], placed)
+        return metrics
+
+    taken = timing.processor_seconds({"whole": update}, options.rounds)
+    row("**whole step**", float("nan"), min(taken["whole"]), float("nan"), peak)
+
+
+def row(name: str, forward_s: float, whole_s: float, arithmetic: float, peak: float) -> None:
+    print(f"| {name} | {forward_s:.3f} | {whole_s:.3f} | {arithmetic / 1e9:.1f} | {arithmetic / whole_s / peak:.0%} |",
+          flush=True)
+
+
+if __name__ == "__main__":
+    main()

@@ -40,8 +40,8 @@ def chamfer_m(prediction: np.ndarray, truth: np.ndarray) -> float:
     """Chamfer distance of two clouds [P, 3] and [Q, 3] in metres, NaN where one of them is empty."""
     if not len(prediction) or not len(truth):
         return float("nan")
-    to_truth, _ = spatial.cKDTree(truth).query(prediction)
-    to_prediction, _ = spatial.cKDTree(prediction).query(truth)
+    to_truth, _ = spatial.cKDTree(truth).query(prediction, workers=-1)
+    to_prediction, _ = spatial.cKDTree(prediction).query(truth, workers=-1)
     return float(to_truth.mean() + to_prediction.mean()) / 2.0
 
 

@@ -40,11 +40,11 @@ def cell_flow(hits: Array, older: Array) -> Array:
     farthest = LAGS * REACH_CELLS  # displacements are tried to the cell over all lags, and taken evenly between them
     sides = np.arange(-farthest, farthest + 1)
     moves = jnp.asarray(np.stack(np.meshgrid(sides, sides, indexing="ij"), axis=-1).reshape(-1, 2))
-    starts = (farthest - np.round(sides[:, None] * (np.arange(1, LAGS + 1) / LAGS))).astype(np.int32)  # in `room`, by lag
+    starts = (farthest - np.round(sides[:, None] * (np.arange(1, LAGS + 1) / LAGS))).astype(np.int32)  # by lag
     # Layers and lags first, cells along y last: the loops below then run over whole rows of cells.
     layers = jnp.moveaxis(hits, -1, 0)
-    room = ((0, 0), (0, 0), (farthest, farthest), (farthest, farthest), (0, 0))
-    room = jnp.moveaxis(jnp.pad(older, room), (1, -1), (0, 1))
+    margin = ((0, 0), (0, 0), (farthest, farthest), (farthest, farthest), (0, 0))
+    room = jnp.moveaxis(jnp.pad(older, margin), (1, -1), (0, 1))  # starts count in it
     rows, columns = hits.shape[1:3]
 
     def agreements_along(starts_x: Array) -> Array:
@@ -52,8 +52,7 @@ def cell_flow(hits: Array, older: Array) -> Array:
         strips = [jax.lax.dynamic_slice_in_dim(room[LAGS - lag], starts_x[lag - 1], rows, axis=2)
                   for lag in range(1, LAGS + 1)]
         matches: dict[tuple[int, int], Array] = {}
-        for lag, start in sorted({place for starts_y in starts.tolist()
-                                  for place in enumerate(starts_y)}):
+        for lag, start in sorted({place for starts_y in starts.tolist() for place in enumerate(starts_y)}):
             moved = strips[lag][..., start:start + columns]
             matches[lag, start] = functools.reduce(operator.add, layers * moved) / LAGS
         return jnp.stack([_block(functools.reduce(operator.add, (matches[place] for place in enumerate(starts_y))))

@@ -10,7 +10,7 @@ from windows import make_window
 
 from muvo_jax import config as config_lib
 from muvo_jax import presets
-from muvo_jax.model import rollout, token_transition, tokens, world_model
+from muvo_jax.model import latents, rollout, tokens, world_model
 from muvo_jax.types import LatentState
 
 pytestmark = pytest.mark.usefixtures("strict_dtypes")
@@ -108,7 +108,7 @@ def test_gru_by_hand():
     reset = sigmoid(dense("reset", joined) + dense("reset_shared", shared))
     moved = np.concatenate([reset * state[0], x[0]], -1)
     new = np.tanh(dense("new", moved) + dense("new_shared", shared))
-    got = token_transition.TokenGRU(2).apply({"params": params}, state, x)[0]
+    got = latents.TokenGRU(2).apply({"params": params}, state, x)[0]
     np.testing.assert_allclose(got, (1 - update) * state[0] + update * new, rtol=1e-5, atol=1e-6)
 
 
@@ -201,7 +201,7 @@ def test_the_posterior_of_the_reference_does_not_mark_its_memory(variables, wind
     start = MODEL.initial_state(BATCH)
     for numerics, expected in (("standard", [True, True]), ("reference", [True, False])):
         # The transition alone: the decoders of the other numerics have other shapes.
-        module = token_transition.TokenTransition(dataclasses.replace(CONFIG, numerics=numerics))
+        module = latents.TokenTransition(dataclasses.replace(CONFIG, numerics=numerics))
         step = jax.jit(lambda params, module=module: module.apply(
             {"params": params["params"]["transition"]}, noise, start, action, embedding, is_first,
             method="observe_step")[1])

@@ -174,14 +174,6 @@ def test_branches_and_policies_work_as_with_vectors(variables, state):
         MODEL.decode(variables, jnp.ones((3, 24)))
 
 
-def test_every_head_at_its_full_size(variables, state):
-    predictions = jax.eval_shape(lambda: MODEL.decode(variables, state.features))
-    view = (CONFIG.range_view.rows, CONFIG.range_view.columns, 4)
-    assert predictions.range_view.shape == (BATCH, *view)
-    assert predictions.at_scale(2).image.shape == (BATCH, *(side // 2 for side in CONFIG.image_size), 3)
-    assert predictions.at_scale(4).occupancy.shape == (BATCH, *(side // 4 for side in CONFIG.voxels.shape), 2)
-
-
 def test_gradients_reach_actions_and_the_start_state(variables, state):
     def target(actions, state):
         return jnp.square(rollout.imagine(MODEL, variables, jax.random.key(3), state, actions).features[:, -1]).sum()

@@ -60,10 +60,11 @@ class EnvState:
 
     Attributes:
       latent: LatentState [...].
-      motion: the car in the ego frame of the start.
+      motion: Motion of the car in the ego frame of the start.
       start: int32, index into the bank.
       time: int32, steps since the start.
-      reward, terminated: float32 and bool, of the step that led here; 0 and false at the start.
+      reward: float32, of the step that led here; 0 at the start.
+      terminated: bool, at that step; false at the start.
     """
 
     latent: LatentState
@@ -76,9 +77,14 @@ class EnvState:
 
 @flax.struct.dataclass
 class Transition:
-    """What a step gives beside the next state: observation of that state, reward, the two ends, and the reward's terms.
+    """What a step gives beside the next state.
 
-    `terminated` and `truncated` are bool and may both be true; `final` is either.
+    Attributes:
+      observation: float32 [P] of that state (model.policy_features), or a dict of decoded heads.
+      reward: float32.
+      terminated: bool, whether the reward function ends the episode.
+      truncated: bool, whether its horizon does; both may be true, and `final` is either.
+      terms: float32 each, what the reward is made of, by name.
     """
 
     observation: Any

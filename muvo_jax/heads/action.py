@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from muvo_jax import head
-from muvo_jax.model import common, decoders
+from muvo_jax.model import decoders
+from muvo_jax.nn import layers
 from muvo_jax.objectives import regression
 
 
@@ -12,5 +13,5 @@ def _losses(learned: head.Learned) -> dict[str, head.Sums]:
 
 
 HEAD = head.Head(
-    targets=lambda model: {"action": (2,)}, build=lambda model: decoders.ActionDecoder(common.compute(model)),
+    targets=lambda model: {"action": (2,)}, build=lambda model: decoders.ActionDecoder(layers.Compute.of(model)),
     tokens="action", losses=_losses, weights=lambda loss: {"action": loss.action})

@@ -17,7 +17,7 @@ from flax import linen
 
 from muvo_jax import head as head_lib
 from muvo_jax.config import ModelConfig, TokenLatent, ZeroGuess
-from muvo_jax.model import common, memory, tokens
+from muvo_jax.model import memory, tokens
 from muvo_jax.nn import layers, norm
 from muvo_jax.ops import resample
 
@@ -271,7 +271,7 @@ def of_range_view(config: ModelConfig, channels: int) -> linen.Module:
 
 def of_voxels(config: ModelConfig, channels: int) -> linen.Module:
     """What fills the voxel grid."""
-    width, compute = config.occupancy_channels, common.compute(config)
+    width, compute = config.occupancy_channels, layers.Compute.of(config)
     if isinstance(config.latent, TokenLatent):
         return TokenDecoder(channels, 2 * width, width, config.latent.occupancy_token_stages, compute)
     return StyledDecoder(config.voxels.shape, channels, 2 * width, width, config.latent.occupancy_blocks,
@@ -280,7 +280,7 @@ def of_voxels(config: ModelConfig, channels: int) -> linen.Module:
 
 def of_ground_plan(config: ModelConfig, classes: int) -> linen.Module:
     """What draws classes and instances on the ground plan of the voxel grid."""
-    width, compute, channels = config.decoder_channels, common.compute(config), classes + INSTANCE_CHANNELS
+    width, compute, channels = config.decoder_channels, layers.Compute.of(config), classes + INSTANCE_CHANNELS
     if isinstance(config.latent, TokenLatent):
         return TokenDecoder(channels, width, width, config.latent.occupancy_token_stages, compute, BirdsEyeHead,
                             flat=True)
@@ -290,11 +290,11 @@ def of_ground_plan(config: ModelConfig, classes: int) -> linen.Module:
 
 def of_numbers(config: ModelConfig, channels: int) -> linen.Module:
     """A few numbers, without an output activation: reward, motion and the like."""
-    return VectorDecoder(channels, config.decoder_channels, common.compute(config))
+    return VectorDecoder(channels, config.decoder_channels, layers.Compute.of(config))
 
 
 def _plane(config: ModelConfig, channels: int, size: tuple[int, int], token_shrink: int) -> linen.Module:
-    width, compute = config.decoder_channels, common.compute(config)
+    width, compute = config.decoder_channels, layers.Compute.of(config)
     if isinstance(config.latent, TokenLatent):
         stages = token_shrink.bit_length() - 4  # three more doublings end in an output each
         return TokenDecoder(channels, width, width, stages, compute)

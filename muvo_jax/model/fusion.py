@@ -13,7 +13,7 @@ from flax import linen
 
 from muvo_jax import config as config_lib
 from muvo_jax.config import ModelConfig
-from muvo_jax.model import common
+from muvo_jax.model import tokens as tokens_lib
 from muvo_jax.nn import attention, layers, norm, resnet
 
 
@@ -50,8 +50,8 @@ class TransformerFuser(linen.Module):
     @linen.compact
     def __call__(self, image_map: jax.Array | None, lidar_map: jax.Array | None, measurements: list[jax.Array],
                  mode: norm.Mode, keys: jax.Array | None) -> jax.Array:
-        config, compute, latent = self.config, common.compute(self.config), self.config.latent
-        fusion = common.token_fusion(config)
+        config, compute, latent = self.config, layers.Compute.of(self.config), self.config.latent
+        fusion = tokens_lib.fusion(config)
         maps = {name: cells for name, cells in (("image", image_map), ("lidar", lidar_map)) if cells is not None}
         channels = fusion.token_channels
         as_tokens = measurements if isinstance(latent, config_lib.TokenLatent) else []
@@ -90,7 +90,7 @@ class PooledFuser(linen.Module):
     def vectors(self, image_map: jax.Array | None, lidar_map: jax.Array | None, measurements: list[jax.Array],
                 mode: norm.Mode, features: int) -> list[jax.Array]:
         """One vector [N, features] a sensor, camera first; to be called in a compact method."""
-        config, compute = self.config, common.compute(self.config)
+        config, compute = self.config, layers.Compute.of(self.config)
         first, *others = (cells for cells in (image_map, lidar_map) if cells is not None)
         spread = [jnp.broadcast_to(value[:, None, None], (*first.shape[:3], value.shape[-1])) for value in measurements]
         joined = jnp.concatenate([first, *spread], axis=-1)
@@ -110,7 +110,7 @@ class ConcatenationFuser(PooledFuser):
         del keys
         latent = config_lib.as_kind(self.config.latent, config_lib.VectorLatent)
         both = self.vectors(image_map, lidar_map, measurements, mode, latent.fused_channels)
-        join = layers.Dense(latent.embedding_channels, common.compute(self.config), name="join")
+        join = layers.Dense(latent.embedding_channels, layers.Compute.of(self.config), name="join")
         return join(jnp.concatenate(both, axis=-1)).astype(jnp.float32)
 
 

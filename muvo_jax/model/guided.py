@@ -15,7 +15,7 @@ from flax import linen
 
 from muvo_jax import head as head_lib
 from muvo_jax.config import ModelConfig
-from muvo_jax.model import common, decoders, memory
+from muvo_jax.model import decoders, memory
 from muvo_jax.model import glimpse as glimpse_lib
 from muvo_jax.nn import layers
 from muvo_jax.ops import conv_cpu
@@ -40,7 +40,7 @@ class GuidedDecoder(linen.Module):
 
     @linen.compact
     def __call__(self, features: jax.Array, seen: jax.Array, numbers: jax.Array) -> dict[int, jax.Array]:
-        config, compute, guide = self.config, common.compute(self.config), self.guide
+        config, compute, guide = self.config, layers.Compute.of(self.config), self.guide
         width = guide.width(config)
         dense = lambda name, x, features: layers.Dense(features, compute, name=name)(x)
         conv = lambda name, x, features: _activation(layers.Conv(features, (3, 3), compute, name=name)(x))
@@ -69,7 +69,7 @@ class GuidedDecoder(linen.Module):
 
     def _latent(self, features: jax.Array, width: int) -> jax.Array:
         """The latent as a map of the plane: the head's tokens, or a vector unfolded."""
-        compute = common.compute(self.config)
+        compute = layers.Compute.of(self.config)
         if features.ndim == 2:
             size = tuple(math.ceil(side / self.guide.shrink) for side in self.guide.plane(self.config))
             seed = layers.Dense(width, compute, name="linear")(features)

@@ -1,4 +1,4 @@
-"""The token groups of the 2D latent: which tokens a state has, which of them a head reads, what a policy reads.
+"""The tokens of fusion and of the 2D latent: which ones a state has, which of them a head reads, what a policy reads.
 
 A state is one row of tokens [..., N, C], group after group in the order of `groups`: the cells of the image, of the
 range view and of the voxel grid, each in row-major order, and one token for the action. All groups are there whatever
@@ -12,10 +12,19 @@ import math
 import jax
 import jax.numpy as jnp
 
-from muvo_jax.config import ModelConfig, PlaneCamera, RangeViewLidar, TokenLatent, as_kind
-from muvo_jax.model import common
+from muvo_jax.config import ModelConfig, PlaneCamera, RangeViewLidar, TokenLatent, TransformerFusion, as_kind
 
 IMAGE_SHRINK, RANGE_VIEW_SHRINK = 32, 16
+
+
+def fusion(config: ModelConfig) -> TransformerFusion:
+    """The fusion of a model that has tokens: every model with the 2D latent, and some others."""
+    return as_kind(config.fusion, TransformerFusion)
+
+
+def fine_maps(config: ModelConfig) -> bool:
+    """Whether fusion takes the sensors' finest maps: where it has no tokens, or many of them."""
+    return not isinstance(config.fusion, TransformerFusion) or config.fusion.many_tokens
 
 
 def groups(config: ModelConfig) -> dict[str, tuple[int, ...]]:
@@ -70,9 +79,9 @@ def of_observation(embedding: jax.Array, config: ModelConfig) -> jax.Array:
     sizes = {group: math.prod(grid) for group, grid in groups(config).items()}
     lidar_ends = embedding.shape[-2] - (config.route + 3 * config.navigation + config.speed)
     placed = {}
-    if isinstance(config.camera, PlaneCamera) and not common.fine_maps(config):
+    if isinstance(config.camera, PlaneCamera) and not fine_maps(config):
         placed["image"] = embedding[..., :sizes["image"], :]
-    if isinstance(config.lidar, RangeViewLidar) and not common.fine_maps(config):
+    if isinstance(config.lidar, RangeViewLidar) and not fine_maps(config):
         placed["range_view"] = embedding[..., lidar_ends - sizes["range_view"]:lidar_ends, :]
     whole = embedding.mean(axis=-2, keepdims=True)
     spread = lambda size: jnp.broadcast_to(whole, (*whole.shape[:-2], size, whole.shape[-1]))

@@ -23,7 +23,7 @@ from flax import linen
 
 from muvo_jax import head as head_lib
 from muvo_jax.config import KNOWN_HEADS, ModelConfig, TokenLatent, TransformerFusion, ZeroGuess
-from muvo_jax.model import camera, decoders, fusion, glimpse, guided, lidar, measurements, tokens, transition
+from muvo_jax.model import decoders, encoders, fusion, glimpse, guided, latents, tokens
 from muvo_jax.model import memory as memory_lib
 from muvo_jax.nn import init as init_lib
 from muvo_jax.nn import norm
@@ -52,17 +52,17 @@ class Network(linen.Module):
     def setup(self):
         config = self.config
         if config.camera is not None:
-            self.camera = camera.REGISTRY[type(config.camera)](config)
+            self.camera = encoders.CAMERAS[type(config.camera)](config)
         if config.lidar is not None:
-            self.lidar = lidar.REGISTRY[type(config.lidar)](config)
+            self.lidar = encoders.LIDARS[type(config.lidar)](config)
         if config.route:
-            self.route = measurements.ROUTE_ENCODERS[config.route_encoder](config)
+            self.route = encoders.ROUTE_ENCODERS[config.route_encoder](config)
         if config.navigation:
-            self.command = measurements.CommandEncoder(config)
-            self.next_command = measurements.CommandEncoder(config)
-            self.target = measurements.TargetEncoder(config)
+            self.command = encoders.CommandEncoder(config)
+            self.next_command = encoders.CommandEncoder(config)
+            self.target = encoders.TargetEncoder(config)
         if config.speed:
-            self.speed = measurements.SpeedEncoder(config)
+            self.speed = encoders.SpeedEncoder(config)
         self.fusion = fusion.REGISTRY[type(config.fusion)](config)
         guessed = memory_lib.guessed_heads(config)
         described = {name: head_lib.get(name) for name in KNOWN_HEADS if name in config.heads}
@@ -165,8 +165,7 @@ class WorldModel:
         if batch is not None:
             self._frames(batch)
         constants = {**decoders.initial_constants(self.config), **guided.initial_constants(self.config),
-                     **transition.initial_constants(self.config),
-                     **fusion.initial_constants(self.config)}
+                     **latents.initial_constants(self.config), **fusion.initial_constants(self.config)}
         return init_lib.fill(self.variable_shapes(), key, constants)
 
     def encode(self, variables: Variables, batch: Batch, *, train: bool = False, keys: jax.Array | None = None,
@@ -206,7 +205,7 @@ class WorldModel:
 
     def initial_state(self, batch_size: int) -> LatentState:
         """The zero state [batch_size, ...], before anything was seen."""
-        return transition.REGISTRY[type(self.config.latent)].initial_state(self.config, batch_size)
+        return latents.TRANSITIONS[type(self.config.latent)].initial_state(self.config, batch_size)
 
     def observe_step(self, variables: Variables, noise: StepNoise, state: LatentState, action: jax.Array,
                      embedding: jax.Array, is_first: jax.Array) -> tuple[LatentState, tuple[Gaussian, Gaussian]]:
@@ -288,7 +287,7 @@ class WorldModel:
     def _move(self, variables: Variables, method: str, *args) -> Any:
         """A step of the transition, by its own part of the variables."""
         own = {kind: tree["transition"] for kind, tree in variables.items() if "transition" in tree}
-        return transition.REGISTRY[type(self.config.latent)](self.config).apply(own, *args, method=method)
+        return latents.TRANSITIONS[type(self.config.latent)](self.config).apply(own, *args, method=method)
 
     def _apply(self, variables: Variables, method: str, *args, **options) -> Any:
         return Network(self.config).apply(variables, *args, method=method, **options)
@@ -316,9 +315,9 @@ def inputs(config: ModelConfig) -> dict[str, tuple[int, ...]]:
     """What a model reads: name of a Batch field -> its shape for one frame."""
     fields: dict[str, tuple[int, ...]] = {}
     if config.camera is not None:
-        fields |= camera.REGISTRY[type(config.camera)].inputs(config)
+        fields |= encoders.CAMERAS[type(config.camera)].inputs(config)
     if config.lidar is not None:
-        fields |= lidar.REGISTRY[type(config.lidar)].inputs(config)
+        fields |= encoders.LIDARS[type(config.lidar)].inputs(config)
     if config.route:
         fields["route_map"] = ROUTE_MAP_SIZE
     if config.navigation:
@@ -330,7 +329,7 @@ def inputs(config: ModelConfig) -> dict[str, tuple[int, ...]]:
 
 @functools.lru_cache(maxsize=8)
 def _variable_shapes(config: ModelConfig) -> dict[str, Any]:
-    network, moving = Network(config), transition.REGISTRY[type(config.latent)](config)
+    network, moving = Network(config), latents.TRANSITIONS[type(config.latent)](config)
     frames = {name: jax.ShapeDtypeStruct((1, *shape), BATCH_FIELDS[name][0]) for name, shape in inputs(config).items()}
     state, key = moving.initial_state(config, 1), jax.random.key(0)
     noise = StepNoise(state.stochastic, state.stochastic, jnp.zeros((1,), jnp.bool_))

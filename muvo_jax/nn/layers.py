@@ -14,6 +14,7 @@ import jax
 import jax.numpy as jnp
 from flax import linen
 
+from muvo_jax.config import ModelConfig
 from muvo_jax.ops import conv as conv_ops
 from muvo_jax.ops import precision
 
@@ -29,6 +30,11 @@ class Compute:
 
     dtype: str = "float32"
     convolution: conv_ops.Implementation = "auto"
+
+    @classmethod
+    def of(cls, config: ModelConfig) -> Compute:
+        """How a model of this configuration does it."""
+        return cls(config.compute_dtype, config.convolution)
 
 
 def shape_only(key: jax.Array, shape: tuple[int, ...]) -> jax.Array:

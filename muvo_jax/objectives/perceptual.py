@@ -15,7 +15,7 @@ import jax.numpy as jnp
 from flax import linen
 
 from muvo_jax import types
-from muvo_jax.model import camera
+from muvo_jax.model import encoders
 from muvo_jax.nn import norm
 from muvo_jax.objectives import regression
 
@@ -37,7 +37,7 @@ class FrozenEncoder:
     def maps(self, pictures: types.Array) -> list[types.Array]:
         """Maps of pictures float32 [..., H, W, 3] in [0, 1], leading axes merged."""
         flat = pictures.reshape(-1, *pictures.shape[-3:])
-        maps: Any = self.network.apply(self.variables, camera.normalise_image(255.0 * flat), norm.Mode())
+        maps: Any = self.network.apply(self.variables, encoders.normalise_image(255.0 * flat), norm.Mode())
         return maps
 
     def distance_sums(self, prediction: types.Array, target: types.Array) -> PerceptualSums:

@@ -34,8 +34,8 @@ class Batch(Indexable):
       depth_m: float32 [B, T, H, W], along the optical axis of `image`; -1 where nothing is near enough to be measured.
       image_classes: uint8 [B, T, H, W], what each pixel shows; 255 unlabelled.
       image_instance_mask: bool [B, T, H, W], whether the pixel shows a vehicle or pedestrian.
-      image_moving_mask: bool [B, T, H, W] and occupancy_moving_mask: bool [B, T, X, Y, Z], where road users on the move
-        are; only scores read them.
+      image_moving_mask: bool [B, T, H, W], where road users on the move are; only scores read it.
+      occupancy_moving_mask: bool [B, T, X, Y, Z], the same of the voxels.
       range_view_classes: uint8 [B, T, Hr, Wr], what each pixel of `range_view` hit; 255 where nothing returned.
       birds_eye_classes: uint8 [B, T, X, Y], what lies on each cell of the ground plan of `occupancy`; 255 unknown.
       birds_eye_instances: int32 [B, T, X, Y], the vehicle or pedestrian there, numbered from 1 in each frame; 0 none.

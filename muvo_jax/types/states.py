@@ -10,7 +10,11 @@ from muvo_jax.types.arrays import Array, Indexable
 
 @flax.struct.dataclass
 class Gaussian(Indexable):
-    """A diagonal Gaussian: mean and std, float32 [..., S]."""
+    """A diagonal Gaussian.
+
+    Attributes:
+      mean, std: float32 [..., S]; tokens [..., N, C] with the 2D latent.
+    """
 
     mean: Array
     std: Array
@@ -59,7 +63,8 @@ class Memory(Indexable):
       pose: float32 [B, F, 3], x, y, yaw of each in the ego frame of the newest, which is the last one.
       range_view: float32 [B, F, Hr, Wr, 4], as Batch.range_view; without lidar there is no memory.
       image: uint8 [B, F, H, W, 3], as Batch.image; None for a model without camera.
-      intrinsics, camera_to_ego: float32 [B, 3, 3] and [B, 4, 4]; None without image.
+      intrinsics: float32 [B, 3, 3]; None without image.
+      camera_to_ego: float32 [B, 4, 4]; None without image.
       evidence: float32 [B, X', Y', 2 Z] for voxels, worked out once for many states (glimpse.with_evidence); or None.
       onward: float32 [B, S, X', Y', Z], beside it what moves, S steps ahead (glimpse.VoxelGlimpse); or None.
     """
@@ -119,7 +124,7 @@ class Observed(Indexable):
     Attributes:
       states: LatentState [B, T, ...], each with its posterior's sample, which is what decoders read (under the RSSM
         dropout of training, the recurrence itself may have gone on from the prior's).
-      posterior, prior: Gaussian [B, T, S].
+      posterior, prior: Gaussian [B, T, ...].
       memory: Memory [B, ...] of the window, for a model with first_guess="last_seen"; `decode` takes it.
     """
 
@@ -136,12 +141,12 @@ class Observed(Indexable):
 
 @flax.struct.dataclass
 class Dream(Indexable):
-    """What `imagine` returns: H imagined steps, time on the axis after the batch (and branch) axes.
+    """What `imagine` returns: H imagined steps, time on the axis after those of the start states and of branches.
 
     Attributes:
-      states: LatentState [B, H, ...] ([B, N, H, ...] with branches); step k is the state after action k.
-      actions: float32 [B, H, 2], the actions that were applied.
-      prior: Gaussian of each step.
+      states: LatentState [..., H, ...]; step k is the state after action k.
+      actions: float32 [..., H, 2], the actions that were applied.
+      prior: Gaussian [..., H, ...] of each step.
     """
 
     states: LatentState

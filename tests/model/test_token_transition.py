@@ -10,7 +10,7 @@ from windows import make_window
 
 from muvo_jax import config as config_lib
 from muvo_jax import presets
-from muvo_jax.model import rollout, token_transition, tokens, world_model
+from muvo_jax.model import latents, rollout, tokens, world_model
 from muvo_jax.types import LatentState
 
 pytestmark = pytest.mark.usefixtures("strict_dtypes")
@@ -108,7 +108,7 @@ def test_gru_by_hand():
     reset = sigmoid(dense("reset", joined) + dense("reset_shared", shared))
     moved = np.concatenate([reset * state[0], x[0]], -1)
     new = np.tanh(dense("new", moved) + dense("new_shared", shared))
-    got = token_transition.TokenGRU(2).apply({"params": params}, state, x)[0]
+    got = latents.TokenGRU(2).apply({"params": params}, state, x)[0]
     np.testing.assert_allclose(got, (1 - update) * state[0] + update * new, rtol=1e-5, atol=1e-6)
 
 
@@ -174,14 +174,6 @@ def test_branches_and_policies_work_as_with_vectors(variables, state):
         MODEL.decode(variables, jnp.ones((3, 24)))
 
 
-def test_every_head_at_its_full_size(variables, state):
-    predictions = jax.eval_shape(lambda: MODEL.decode(variables, state.features))
-    view = (CONFIG.range_view.rows, CONFIG.range_view.columns, 4)
-    assert predictions.range_view.shape == (BATCH, *view)
-    assert predictions.at_scale(2).image.shape == (BATCH, *(side // 2 for side in CONFIG.image_size), 3)
-    assert predictions.at_scale(4).occupancy.shape == (BATCH, *(side // 4 for side in CONFIG.voxels.shape), 2)
-
-
 def test_gradients_reach_actions_and_the_start_state(variables, state):
     def target(actions, state):
         return jnp.square(rollout.imagine(MODEL, variables, jax.random.key(3), state, actions).features[:, -1]).sum()
@@ -201,7 +193,7 @@ def test_the_posterior_of_the_reference_does_not_mark_its_memory(variables, wind
     start = MODEL.initial_state(BATCH)
     for numerics, expected in (("standard", [True, True]), ("reference", [True, False])):
         # The transition alone: the decoders of the other numerics have other shapes.
-        module = token_transition.TokenTransition(dataclasses.replace(CONFIG, numerics=numerics))
+        module = latents.TokenTransition(dataclasses.replace(CONFIG, numerics=numerics))
         step = jax.jit(lambda params, module=module: module.apply(
             {"params": params["params"]["transition"]}, noise, start, action, embedding, is_first,
             method="observe_step")[1])

@@ -9,7 +9,7 @@ import pytest
 from windows import make_window
 
 from muvo_jax import presets
-from muvo_jax.model import rollout, transition, world_model
+from muvo_jax.model import latents, rollout, world_model
 from muvo_jax.types import LatentState, StepNoise
 
 pytestmark = pytest.mark.usefixtures("strict_dtypes")
@@ -39,12 +39,12 @@ def test_gru_by_hand():
     reset = sigmoid(from_input[:, 0:2] + from_state[:, 0:2])
     update = sigmoid(from_input[:, 2:4] + from_state[:, 2:4])
     new = np.tanh(from_input[:, 4:6] + reset * from_state[:, 4:6])
-    got = transition.GRUCell(2).apply({"params": params}, state, x)
+    got = latents.GRUCell(2).apply({"params": params}, state, x)
     np.testing.assert_allclose(got, (1 - update) * new + update * state, rtol=1e-5, atol=1e-6)
 
 
 def test_std_is_bounded_and_one_point_one_at_zero():
-    head = transition.GaussianHead(2, 4, 0.01)
+    head = latents.GaussianHead(2, 4, 0.01)
     shapes = jax.eval_shape(head.init, jax.random.key(0), jnp.zeros((1, 3)), jnp.zeros((1, 2)))["params"]
     params = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape), shapes)
     x, action = jnp.ones((1, 3)), jnp.ones((1, 2))

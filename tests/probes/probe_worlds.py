@@ -17,7 +17,7 @@ from muvo_jax import config as config_lib
 from muvo_jax import presets, types
 from muvo_jax.agents import sensitivity
 from muvo_jax.metrics import baselines
-from muvo_jax.model import camera, lidar, rollout, world_model
+from muvo_jax.model import encoders, rollout, world_model
 from muvo_jax.nn import layers
 from muvo_jax.ops import conv_cpu
 from muvo_jax.ops import range_view as range_view_ops
@@ -131,16 +131,16 @@ def wall_ahead(distance_m):
     return np.where(ahead[..., None], view, (0.0, 0.0, 0.0, types.RANGE_NO_RETURN_M)).astype(np.float32)
 
 
-class PatchCamera(camera.PlaneEncoder):
+class PatchCamera(encoders.PlaneEncoder):
     """[N, H/32, W/32, C], as PlaneCamera."""
 
     @linen.compact
     def __call__(self, frames, mode):
         del mode
-        return patches(camera.normalise_image(frames["image"]), 32, self.config.fusion.token_channels)
+        return patches(encoders.normalise_image(frames["image"]), 32, self.config.fusion.token_channels)
 
 
-class PatchLidar(lidar.RangeViewEncoder):
+class PatchLidar(encoders.RangeViewEncoder):
     """[N, Hr/32, Wr/32, C], /16 for the 2D latent, as RangeViewLidar."""
 
     @linen.compact

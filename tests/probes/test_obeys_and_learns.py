@@ -15,7 +15,7 @@ import probe_worlds
 import pytest
 
 from muvo_jax import config as config_lib
-from muvo_jax.model import camera, lidar
+from muvo_jax.model import encoders
 
 WORLDS = {"bar": probe_worlds.Bar(), "wall": probe_worlds.Wall()}
 FAINT = pytest.mark.xfail(strict=True, reason="ranges are drawn too near their mean, of observed frames too")
@@ -24,8 +24,8 @@ NOISE = 10.0  # standard deviation of the noise in the overfitted batch, grey va
 
 @pytest.fixture(autouse=True)
 def encoders_that_compile_in_no_time(monkeypatch):
-    monkeypatch.setitem(camera.REGISTRY, config_lib.PlaneCamera, probe_worlds.PatchCamera)
-    monkeypatch.setitem(lidar.REGISTRY, config_lib.RangeViewLidar, probe_worlds.PatchLidar)
+    monkeypatch.setitem(encoders.CAMERAS, config_lib.PlaneCamera, probe_worlds.PatchCamera)
+    monkeypatch.setitem(encoders.LIDARS, config_lib.RangeViewLidar, probe_worlds.PatchLidar)
 
 
 @functools.cache

@@ -13,7 +13,7 @@ import numpy as np
 from flax import linen
 
 from muvo_jax import presets, types
-from muvo_jax.model import transition
+from muvo_jax.model import latents
 from muvo_jax.nn import attention, layers, norm
 from muvo_jax.objectives import labels
 
@@ -24,7 +24,7 @@ class SmallNetwork(linen.Module):
     config: object
 
     def setup(self):
-        self.transition = transition.VectorTransition(self.config)
+        self.transition = latents.VectorTransition(self.config)
         self.convolution = layers.Conv(4, (3, 3), layers.Compute(convolution="xla"), stride=2)
         self.range_convolution = layers.Conv(4, (3, 3), layers.Compute(convolution="xla"), stride=2)
         self.norm, self.range_norm = norm.BatchNorm(), norm.BatchNorm()
@@ -76,7 +76,7 @@ class SmallWorld:
         return batch.image[:, 0], batch.range_view[:, 0], noise, batch.action[:, 0], state, batch.is_first[:, 0]
 
     def initial_state(self, batch_size):
-        return transition.VectorTransition.initial_state(self.config, batch_size)
+        return latents.VectorTransition.initial_state(self.config, batch_size)
 
     def encode(self, variables, batch, *, train, keys, axis_name):
         merge = lambda leaf: leaf.reshape(-1, *leaf.shape[2:])

@@ -167,18 +167,8 @@ def test_curves_leave_gaps_and_survive_constant_and_missing_values(tmp_path):
 
 
 def test_nothing_to_draw_is_an_error(tmp_path):
-    with pytest.raises(ValueError, match="no frames"):
-        canvas.save_gif(tmp_path / "a.gif", [], 0.1)
     with pytest.raises(ValueError, match="no plots"):
         curves.write_curves(tmp_path / "a.png", [], "run")
-
-
-def test_resize_hard_keeps_only_colours_that_were_there():
-    picture = np.zeros((3, 5, 3), np.uint8)
-    picture[1, 2] = (10, 20, 30)
-    large = canvas.resize_hard(picture, 13)
-    assert large.shape == (8, 13, 3)
-    assert {tuple(pixel) for pixel in large.reshape(-1, 3).tolist()} == {(0, 0, 0), (10, 20, 30)}
 
 
 def test_optional_maps_have_panels_where_truth_has_them_too(tmp_path):

@@ -18,7 +18,7 @@ from muvo_jax import types
 from muvo_jax.interop.parity import cases, drawing, rounding
 from muvo_jax.metrics import image as image_metrics
 from muvo_jax.metrics import occupancy, points, streaming
-from muvo_jax.model import camera
+from muvo_jax.model import encoders
 from muvo_jax.nn import resnet
 from muvo_jax.objectives import classification, kl, perceptual, regression, scal, similarity
 from muvo_jax.ops import nearest
@@ -329,7 +329,7 @@ def perceptual_maps(network: resnet.ResNet18, weights: Any, picture: jax.Array) 
     """Maps of pictures [B, S, 3, H, W] in [0, 1]."""
     flat = _last(picture).reshape(-1, *picture.shape[3:], 3)
     mean, std = (jnp.asarray(value, jnp.float32).reshape(1, 1, 1, 3)
-                 for value in (camera.IMAGENET_MEAN, camera.IMAGENET_STD))
+                 for value in (encoders.IMAGENET_MEAN, encoders.IMAGENET_STD))
     return network.apply(weights, (flat - mean) / std, drawing.EVAL)
 
 

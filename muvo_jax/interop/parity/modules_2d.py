@@ -10,7 +10,7 @@ import numpy as np
 from muvo_jax import config as config_lib
 from muvo_jax.interop import unused_modules
 from muvo_jax.interop.parity import cases, drawing, modules_1d
-from muvo_jax.model import decoders, token_transition
+from muvo_jax.model import decoders, latents
 from muvo_jax.nn import resnet
 
 TOLERANCE, STYLED_TOLERANCE = modules_1d.TOLERANCE, modules_1d.STYLED_TOLERANCE
@@ -29,7 +29,7 @@ def recurrent_units(context: cases.Context) -> Checks:
     """The inputs hold tokens before the batch."""
     shape = context.shape("gru_glo/out") or (33, 2, 384)
     state, x = (np.swapaxes(context.draw(name, shape, "normal"), 0, 1) for name in ("gg_h", "gg_x"))
-    out = drawing.run(token_transition.TokenGRU(384), state, x, where="transition/gru/")
+    out = drawing.run(latents.TokenGRU(384), state, x, where="transition/gru/")
     yield cases.Check("gru_glo/out", np.swapaxes(out, 0, 1), TOLERANCE)
     shape = context.shape("gru_plain/out") or (11, 2, 48)
     state, x = (context.draw(name, shape, "normal") for name in ("gp_h", "gp_x"))
@@ -41,7 +41,7 @@ def representations(context: cases.Context) -> Checks:
     for name, drawn, config, rename in (("representation_td384", "rep_mem", CONFIG, None),
                                         ("representation_td48", "rep_mem48", NARROW, _narrow_key)):
         memory = np.swapaxes(context.draw(drawn, context.size("p3_2d", drawn), "normal"), 0, 1)
-        out = drawing.run(token_transition.TokenGaussianHead(config), memory, where="transition/prior/", rename=rename,
+        out = drawing.run(latents.TokenGaussianHead(config), memory, where="transition/prior/", rename=rename,
                           static=(None, 0))
         yield cases.Check(f"{name}/mu", np.swapaxes(out.mean, 0, 1), TOLERANCE)
         yield cases.Check(f"{name}/sigma", np.swapaxes(out.std, 0, 1), TOLERANCE)
@@ -58,7 +58,7 @@ def transition(context: cases.Context) -> Checks:
 def _transition(context: cases.Context, name: str, config: config_lib.ModelConfig, rename) -> Checks:
     sizes = modules_1d.transition_sizes(context, f"rssmtd{name}", "p3_2d", f"rssmtd{name}")
     tokens = context.size("p3_2d", f"rssmtd{name}", "tokens")
-    _, channels = token_transition.TokenTransition.state_shapes(config)[0]
+    _, channels = latents.TokenTransition.state_shapes(config)[0]
     embedding = context.draw(f"td{name}_emb", (*sizes[:2], channels, tokens), "normal")
     yield from modules_1d.transition_checks(
         context, config, f"td{name}", f"rssmtd{name}", *sizes, embedding=np.swapaxes(embedding, 2, 3), rename=rename,

@@ -12,7 +12,7 @@ from muvo_jax import config as config_lib
 from muvo_jax.geometry import BirdsEyeGrid, PillarGrid
 from muvo_jax.interop import reference_preprocess as preprocess
 from muvo_jax.interop.parity import cases, drawing, golden, rounding
-from muvo_jax.model import lidar
+from muvo_jax.model import encoders
 from muvo_jax.nn import norm
 from muvo_jax.ops import frustum, resample
 
@@ -95,7 +95,7 @@ def point_pillars(context: cases.Context) -> Checks:
     clouds = [context.draw(f"pp_cloud{index}", (context.size("p2", "pillar_points"),), "cloud")
               for index in range(len(count))]
     points = jnp.asarray(np.stack(clouds).astype(np.float32))
-    net = lidar.PillarNet(config_lib.ModelConfig(numerics="reference"), PillarGrid())
+    net = encoders.PillarNet(config_lib.ModelConfig(numerics="reference"), PillarGrid())
     shapes = jax.eval_shape(lambda key: net.init(key, points, count, drawing.EVAL), jax.random.key(0))
     variables = drawing.draw_variables(shapes, where="lidar/pillars/")
     occupied = context.file["pillars/occupied_flat"]

@@ -1,7 +1,8 @@
 """Driving a simulator closed loop: observe, filter, plan in imagination, apply the first action, again.
 
 The simulator comes as functions, so that any one will do; a driver is a function of what it remembers and of the
-simulator's state. `planning_driver` makes one of a world model; the others are what it is measured against.
+simulator's state. `planning_driver` makes one of a world model, `policy_driver` one of a policy that reads its latents;
+the others are what they are measured against.
 """
 
 from __future__ import annotations
@@ -18,7 +19,8 @@ import numpy as np
 
 from muvo_jax.agents import environment as environment_lib
 from muvo_jax.agents import planners
-from muvo_jax.model import glimpse, live
+from muvo_jax.model import checks, glimpse, live
+from muvo_jax.model.world_model import WorldModel
 from muvo_jax.ops import motion as motion_ops
 from muvo_jax.types import Array, ArrayLike, LatentState, Memory, Variables
 
@@ -82,6 +84,13 @@ class PlanMemory:
     live: live.LiveState
     plan: Array
     value: Array
+
+
+@flax.struct.dataclass
+class PolicyMemory:
+    """What a policy's driver remembers: the filter's state, of a batch of one."""
+
+    live: live.LiveState
 
 
 @dataclasses.dataclass(frozen=True)
@@ -210,6 +219,47 @@ def plan_step(environment: environment_lib.Environment, planner: str, config: pl
     objective = returns(environment, params, state, discount=discount)
     plan = planners.PLANNERS[planner](objective, key, planners.shift(memory.plan), config)
     return PlanMemory(filtered, plan.actions, plan.value)
+
+
+# (key, WorldModel.policy_features [B, P]) -> actions [B, 2] in [-1, 1].
+FeaturePolicy = Callable[[Array, Array], Array]
+
+
+def policy_driver(simulator: Simulator, model: WorldModel, variables: Variables, policy: FeaturePolicy, *,
+                  sampled: bool = False) -> Driver:
+    """Drives by a policy that reads what the model makes of the sensors: filter, act; compiled once.
+
+    Args:
+      simulator: only its `observe` is used; it must give all that the model reads.
+      model, variables: of the run in whose imagination the policy learned.
+      policy: as for Environment.play: (key, model.policy_features [B, P]) -> actions [B, 2], clipped to [-1, 1]. One
+        with parameters comes as jax.tree_util.Partial(function, parameters), as actor_critic.policy makes it, so that
+        new parameters compile nothing anew. Whether it draws its actions or takes its mode is its own affair.
+      sampled: sample the filter's latents instead of taking their means, which is what planning_driver does.
+
+    Raises (while driving):
+      ValueError: for an action of another shape, or one that is not finite, naming its step.
+    """
+    driver_policy = policy if isinstance(policy, jax.tree_util.Partial) else jax.tree_util.Partial(policy)
+
+    def driver(key, memory, state, previous):
+        key_filter, key_policy = jax.random.split(key)
+        stream = live.start_live(model, key_filter) if memory is None else memory.live
+        observation = {name: np.asarray(value)[None] for name, value in simulator.observe(state).items()}
+        step = int(stream.frame[0])
+        stream = live.observe_step(model, variables, stream, observation, previous[None], sampled=sampled)
+        action = np.asarray(_act(model, driver_policy, key_policy, stream.latent.features)[0])
+        if not np.isfinite(action).all():
+            raise ValueError(f"policy_driver: at step {step}, counted from the first observation, the policy chose "
+                             f"{action.tolist()}; expected two finite numbers in [-1, 1] (acceleration, steering).")
+        return PolicyMemory(stream), action
+
+    return driver
+
+
+@functools.partial(jax.jit, static_argnames=("model",))
+def _act(model: WorldModel, policy: jax.tree_util.Partial, key: Array, features: Array) -> Array:
+    return checks.policy_action(policy(key, model.policy_features(features)), features)
 
 
 def latents(moments: Sequence[Moment]) -> tuple[LatentState, Memory | None, Array]:

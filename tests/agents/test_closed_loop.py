@@ -1,6 +1,7 @@
 import dataclasses
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 import worlds
@@ -98,12 +99,7 @@ def test_the_planner_filters_every_step_plans_for_progress_and_compiles_once():
 
 
 def test_the_planner_stops_before_a_wall_unless_collisions_cost_nothing():
-    grid, bare = worlds.CONFIG.range_view, road(wall_m=16.0)
-
-    def observe(state):
-        return bare.observe(state) | {"range_view": np.full((grid.rows, grid.columns, 4), 16.0 - state[0], np.float32)}
-
-    world = dataclasses.replace(bare, observe=observe)
+    world = before_the_wall(16.0)
     config, drives = planners.PlannerConfig(plans=48, iterations=6, std=0.7), {}
     for collision in (5.0, 0.0):
         environment, _ = worlds.before_a_wall(16.0, 5.0, 8, collision=collision)
@@ -112,6 +108,44 @@ def test_the_planner_stops_before_a_wall_unless_collisions_cost_nothing():
     assert drives[0.0].end.collided
     assert drives[5.0].unharmed and drives[5.0].steps == 25
     assert drives[5.0].progress_m > 7.0  # it drove on to where the wall was near
+
+
+def before_the_wall(wall_m):
+    """A road with a wall that worlds.WALL_MODEL sees: all ranges are the distance to it."""
+    grid, bare = worlds.CONFIG.range_view, road(wall_m=wall_m)
+
+    def observe(state):
+        return bare.observe(state) | {"range_view": np.full((grid.rows, grid.columns, 4), wall_m - state[0],
+                                                            np.float32)}
+
+    return dataclasses.replace(bare, observe=observe)
+
+
+def test_a_policy_drives_by_what_the_model_makes_of_the_sensors_and_compiles_once():
+    """The first two features are metres to the wall and speed; the policy wants a third of the metres as m/s."""
+    def wanted(share, key, features):
+        assert features.shape == (1, worlds.WALL_MODEL.policy_feature_channels)
+        return jnp.stack([share * features[:, 0] - features[:, 1], 0.0 * features[:, 0]], axis=-1)
+
+    world, ends, compiled = before_the_wall(16.0), [], []
+    for share in (1 / 3, 1 / 6):
+        driver = closed_loop.policy_driver(world, worlds.WALL_MODEL, {}, jax.tree_util.Partial(wanted, share))
+        done = run(world, driver, steps=25)
+        ends.append(done.moments[-1].state)
+        compiled.append(closed_loop._act._cache_size())
+    assert done.unharmed and done.moments[-1].memory.live.frame == 2 + 25
+    assert ends[0][0] > ends[1][0] + 1.0  # nearer to the wall, and both before it
+    assert all(position < 16.0 for position, _ in ends)
+    assert compiled[0] == compiled[1]
+    assert all((np.abs(moment.action) <= 1.0).all() for moment in done.moments)
+
+
+def test_a_policys_action_that_is_no_number_is_named_with_its_step():
+    world = before_the_wall(16.0)
+    losing = lambda key, features: jnp.where(features[:, :1] < 12.5, jnp.nan, jnp.zeros((1, 2)))
+    driver = closed_loop.policy_driver(world, worlds.WALL_MODEL, {}, losing)
+    with pytest.raises(ValueError, match=r"at step 4, .* the policy chose \[nan, nan\]"):
+        run(world, driver)
 
 
 @pytest.mark.parametrize(("options", "message"), [

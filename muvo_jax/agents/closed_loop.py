@@ -34,12 +34,15 @@ class Situation:
       collided: whether the car touches something.
       lost: whether it left its route.
       arrived: whether the route is at its end.
+      speed_mps, heading_rad: of the car, for its passengers' comfort; NaN where the simulator does not say.
     """
 
     progress_m: float
     collided: bool = False
     lost: bool = False
     arrived: bool = False
+    speed_mps: float = float("nan")
+    heading_rad: float = float("nan")
 
     @property
     def over(self) -> bool:
@@ -109,14 +112,19 @@ class Drive:
     Attributes:
       progress_m: metres along the route until the end, or until the collision or the loss of the route.
       steps: that were driven.
-      end: the Situation at the end.
-      moments: its steps.
+      situations: before the first step and after each.
+      moments: its steps; nothing else holds observations.
     """
 
     progress_m: float
     steps: int
-    end: Situation
+    situations: tuple[Situation, ...]
     moments: tuple[Moment, ...]
+
+    @property
+    def end(self) -> Situation:
+        """Where it stood at the end."""
+        return self.situations[-1]
 
     @property
     def unharmed(self) -> bool:
@@ -144,17 +152,18 @@ def drive(simulator: Simulator, driver: Driver, key: Array, seed: int, steps: in
         memory, _ = driver(jax.random.fold_in(key, step), memory, state, previous)
         previous = np.asarray(simulator.expert(state), np.float32)
         state = simulator.step(state, previous)
-    now = start = simulator.situation(state)
-    if start.over:
-        raise ValueError(f"drive: with seed {seed} the expert's drive was over before the takeover: {start}.")
+    situations = [simulator.situation(state)]
+    if situations[0].over:
+        raise ValueError(f"drive: with seed {seed} the expert's drive was over before the takeover: {situations[0]}.")
     moments: list[Moment] = []
-    while len(moments) < steps and not now.over:
+    while len(moments) < steps and not situations[-1].over:
         key_step = jax.random.fold_in(key, context + len(moments))
         memory, previous = driver(key_step, memory, state, previous)
         moments.append(Moment(state, previous, memory))
         state = simulator.step(state, previous)
-        now = simulator.situation(state)
-    return Drive(now.progress_m - start.progress_m, len(moments), now, tuple(moments))
+        situations.append(simulator.situation(state))
+    metres = situations[-1].progress_m - situations[0].progress_m
+    return Drive(metres, len(moments), tuple(situations), tuple(moments))
 
 
 def planning_driver(simulator: Simulator, environment: environment_lib.Environment, variables: Variables,
@@ -262,13 +271,18 @@ def _act(model: WorldModel, policy: jax.tree_util.Partial, key: Array, features:
     return checks.policy_action(policy(key, model.policy_features(features)), features)
 
 
-def latents(moments: Sequence[Moment]) -> tuple[LatentState, Memory | None, Array]:
-    """The filtered latents [T, ...], what they remember [T, ...] and plans [T, H, 2] of a planned drive."""
+def latents(moments: Sequence[Moment]) -> tuple[LatentState, Memory | None]:
+    """The filtered latents [T, ...] of a drive by plans or a policy, and what they remember [T, ...]."""
     stack = lambda *leaves: jnp.concatenate(leaves)
     streams = [moment.memory.live for moment in moments]
     states, memory = (jax.tree.map(stack, *parts) for parts in zip(*((live.latent, live.memory) for live in streams),
                                                                    strict=True))
-    return states, memory, jnp.stack([moment.memory.plan for moment in moments])
+    return states, memory
+
+
+def plans(moments: Sequence[Moment]) -> Array:
+    """The plans [T, H, 2] of a planned drive."""
+    return jnp.stack([moment.memory.plan for moment in moments])
 
 
 def expert_driver(simulator: Simulator) -> Driver:
@@ -286,30 +300,3 @@ def random_driver() -> Driver:
     """A uniform action in [-1, 1] at every step."""
     draw = lambda key: np.asarray(jax.random.uniform(key, (2,), jnp.float32, minval=-1.0))
     return lambda key, memory, state, previous: (memory, draw(key))
-
-
-def summarise(drives: Mapping[str, Sequence[Drive]], expert: str, route_m: float) -> dict[str, dict[str, float]]:
-    """Scores of each driver over drives of the same seeds.
-
-    Args:
-      drives: driver -> its drives, in the order of the seeds.
-      expert: the driver against whose metres progress is measured.
-      route_m: length of a route.
-
-    Returns:
-      driver -> {"success": share of drives without collision or loss of the route, "route_share": mean share of the
-      route driven until then, "collisions", "lost": counts, "progress_m": mean metres, "progress": metres of all drives
-      over the expert's (nan where it stood still), "seconds_share": steps driven over the expert's, "drives": count}.
-    """
-    expert_m = sum(one.progress_m for one in drives[expert])
-    expert_steps = sum(one.steps for one in drives[expert])
-    scores = {}
-    for name, runs in drives.items():
-        metres = sum(one.progress_m for one in runs)
-        scores[name] = {
-            "drives": len(runs), "success": float(np.mean([one.unharmed for one in runs])),
-            "route_share": metres / len(runs) / route_m, "collisions": sum(one.end.collided for one in runs),
-            "lost": sum(one.end.lost for one in runs), "progress_m": metres / len(runs),
-            "progress": metres / expert_m if expert_m > 0 else float("nan"),
-            "seconds_share": sum(one.steps for one in runs) / expert_steps}
-    return scores

@@ -25,7 +25,7 @@ COLUMNS = {"success": ("success", "{:.0%}"), "collisions": ("collisions", "{}"),
            "progress_m": ("metres", "{:.1f}"), "progress": ("of expert's metres", "{:.0%}"),
            "acceleration_mps2": ("along, m/s2", "{:.2f}"), "lateral_mps2": ("across, m/s2", "{:.2f}"),
            "hard_share": (f"steps above {drive_scores.HARD_MPS2:g} m/s2", "{:.1%}")}
-ON_SCREEN = ("success", "progress_m", "progress")  # with their intervals; the page has all
+ON_SCREEN = ("success", "progress_m")  # with their intervals; the page has all
 
 
 def describe(drive: closed_loop.Drive, seed: int) -> dict[str, Any]:
@@ -45,8 +45,8 @@ def table(scores: Mapping[str, Mapping[str, Any]], with_interval: tuple[str, ...
 
 def _cell(found, score, form, with_interval):
     text = form.format(found[score])
-    low, high = found.get(f"{score}_interval", (math.nan, math.nan))
-    return text if not with_interval or math.isnan(low) else f"{text} [{form.format(low)}..{form.format(high)}]"
+    low, high = (form.format(end).rstrip("%") for end in found.get(f"{score}_interval", (math.nan, math.nan)))
+    return text if not with_interval or low == "nan" else f"{text} [{low}..{high}]"
 
 
 def screen_table(report: Mapping[str, Any]) -> rich.table.Table:

@@ -143,13 +143,15 @@ def drive(simulator: Simulator, driver: Driver, key: Array, seed: int, steps: in
       context: steps before it, in which the expert drives and the driver watches: it is called, its action is not used.
 
     Raises:
-      ValueError: if steps is below 1 or context negative, or the drive is over before the takeover.
+      ValueError: if steps is below 1 or context negative, the drive is over before the takeover, or the driver chooses
+        what is no number, naming the step.
     """
     if steps < 1 or context < 0:
         raise ValueError(f"drive: got steps={steps} and context={context}; expected at least 1 and 0.")
     state, memory, previous = simulator.reset(seed), None, np.zeros(2, np.float32)
     for step in range(context):
-        memory, _ = driver(jax.random.fold_in(key, step), memory, state, previous)
+        memory, unused = driver(jax.random.fold_in(key, step), memory, state, previous)
+        _check_action(unused, seed, step)
         previous = np.asarray(simulator.expert(state), np.float32)
         state = simulator.step(state, previous)
     situations = [simulator.situation(state)]
@@ -159,11 +161,19 @@ def drive(simulator: Simulator, driver: Driver, key: Array, seed: int, steps: in
     while len(moments) < steps and not situations[-1].over:
         key_step = jax.random.fold_in(key, context + len(moments))
         memory, previous = driver(key_step, memory, state, previous)
+        _check_action(previous, seed, context + len(moments))
         moments.append(Moment(state, previous, memory))
         state = simulator.step(state, previous)
         situations.append(simulator.situation(state))
     metres = situations[-1].progress_m - situations[0].progress_m
     return Drive(metres, len(moments), tuple(situations), tuple(moments))
+
+
+def _check_action(action: np.ndarray, seed: int, step: int) -> None:
+    if np.shape(action) != (2,) or not np.isfinite(action).all():
+        raise ValueError(f"drive: with seed {seed}, at step {step} from the first observation on, the driver chose "
+                         f"{np.asarray(action).tolist()}; expected two finite numbers in [-1, 1] (acceleration, "
+                         f"steering).")
 
 
 def planning_driver(simulator: Simulator, environment: environment_lib.Environment, variables: Variables,
@@ -245,9 +255,6 @@ def policy_driver(simulator: Simulator, model: WorldModel, variables: Variables,
         with parameters comes as jax.tree_util.Partial(function, parameters), as actor_critic.policy makes it, so that
         new parameters compile nothing anew. Whether it draws its actions or takes its mode is its own affair.
       sampled: sample the filter's latents instead of taking their means, which is what planning_driver does.
-
-    Raises (while driving):
-      ValueError: for an action of another shape, or one that is not finite, naming its step.
     """
     driver_policy = policy if isinstance(policy, jax.tree_util.Partial) else jax.tree_util.Partial(policy)
 
@@ -255,13 +262,8 @@ def policy_driver(simulator: Simulator, model: WorldModel, variables: Variables,
         key_filter, key_policy = jax.random.split(key)
         stream = live.start_live(model, key_filter) if memory is None else memory.live
         observation = {name: np.asarray(value)[None] for name, value in simulator.observe(state).items()}
-        step = int(stream.frame[0])
         stream = live.observe_step(model, variables, stream, observation, previous[None], sampled=sampled)
-        action = np.asarray(_act(model, driver_policy, key_policy, stream.latent.features)[0])
-        if not np.isfinite(action).all():
-            raise ValueError(f"policy_driver: at step {step}, counted from the first observation, the policy chose "
-                             f"{action.tolist()}; expected two finite numbers in [-1, 1] (acceleration, steering).")
-        return PolicyMemory(stream), action
+        return PolicyMemory(stream), np.asarray(_act(model, driver_policy, key_policy, stream.latent.features)[0])
 
     return driver
 

@@ -130,7 +130,7 @@ def test_a_policys_action_that_is_no_number_is_named_with_its_step():
     world = before_the_wall(16.0)
     losing = lambda key, features: jnp.where(features[:, :1] < 12.5, jnp.nan, jnp.zeros((1, 2)))
     driver = closed_loop.policy_driver(world, worlds.WALL_MODEL, {}, losing)
-    with pytest.raises(ValueError, match=r"at step 4, .* the policy chose \[nan, nan\]"):
+    with pytest.raises(ValueError, match=r"seed 0, at step 4 .* the driver chose \[nan, nan\]"):
         run(world, driver)
 
 

@@ -9,6 +9,7 @@ import pytest
 
 from muvo_jax import command_line, drive, presets, town_drive
 from muvo_jax import config as config_lib
+from muvo_jax import run as run_lib
 from muvo_jax.agents import closed_loop, drive_scores, sensitivity
 from muvo_jax.model import world_model
 from muvo_jax.town import settings
@@ -129,8 +130,19 @@ def test_who_is_named_drives_and_the_report_says_how(folder, tmp_path):
     assert len(stored["drives"]["constant"]) == 2 and stored["scores"]["constant"]["acceleration_mps2"] < 1e-6
     page = (tmp_path / "drive.md").read_text()
     assert "| driver | success | collisions | off route | metres | of expert's metres |" in page
-    assert "| constant | 100% [34%..100%] | 0 | 0 |" in page and "answer to actions" not in page
+    assert "| constant | 100% [34..100] | 0 | 0 |" in page and "answer to actions" not in page
     assert (tmp_path / "drive.gif").is_file()
+
+
+def test_a_planner_that_sees_no_obstacles_says_so(town, capsys):
+    config = config_lib.override(presets.tiny(), "model.heads", ("image", "action"))
+    blind = run_lib.Run(world_model.WorldModel(config.model), {}, config)
+    options = drive.Options("r", horizon=3)
+    assert callable(drive.driver_of("planner", options, blind, town_drive.town_simulator(town, config), None,
+                                    screen.Screen()))
+    printed = capsys.readouterr().out
+    assert "has no head occupancy: the planner sees no obstacles" in printed
+    assert "planning 3 steps ahead; training imagined 2" in printed
 
 
 @pytest.mark.parametrize(("options", "message"), [

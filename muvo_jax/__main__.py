@@ -10,7 +10,7 @@ import sys
 
 from muvo_jax import command_line
 
-COMMANDS = ("train", "evaluate", "dream", "plan_drive", "doctor", "voxelize", "pack", "record_carla", "export_muvo",
+COMMANDS = ("train", "evaluate", "dream", "drive", "doctor", "voxelize", "pack", "record_carla", "export_muvo",
             "convert", "export", "interop.export_torch", "interop.parity")
 
 
@@ -24,7 +24,7 @@ def describe(command: str) -> tuple[str, str]:
 
 
 def main() -> int:
-    """Calls the command that the first argument names (train, plan_drive or plan-drive), or lists them all.
+    """Calls the command that the first argument names (train, record_carla or record-carla), or lists them all.
 
     Returns:
       The exit code, 2 where there is no such command.

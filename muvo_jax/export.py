@@ -29,8 +29,7 @@ with late.imports():
     import jax
 
     from muvo_jax import config as config_lib
-    from muvo_jax import types
-    from muvo_jax.interop import safetensors_file
+    from muvo_jax import safetensors_file, types
     from muvo_jax.model import live as live_lib
     from muvo_jax.model import memory as memory_lib
     from muvo_jax.model import rollout, world_model

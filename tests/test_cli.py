@@ -98,7 +98,7 @@ def test_help_costs_less_than_a_second_and_a_half_of_processor_time(command):
     assert after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime < 1.5
 
 
-@pytest.mark.parametrize("called", ["plan_drive", "plan-drive", "interop.export_torch", "export-torch"])
+@pytest.mark.parametrize("called", ["record_carla", "record-carla", "interop.export_torch", "export-torch"])
 def test_a_command_is_called_by_its_name(called, capsys, monkeypatch):
     monkeypatch.setattr(sys, "argv", ["/usr/bin/muvo", called, "--help"])
     with pytest.raises(SystemExit) as ended:
@@ -120,7 +120,7 @@ def test_only_training_starts_the_process_anew_and_only_once_the_flags_are_right
 
 @pytest.mark.parametrize(("command", "option"), [
     ("train", "--steps=-1"), ("train", "--workers=0"), ("doctor", "--frames=-1"), ("dream", "--branches=-2"),
-    ("plan_drive", "--episodes=-1"), ("plan_drive", "--seconds=-1"), ("record_carla", "--vehicles=-1"),
+    ("drive", "--episodes=-1"), ("drive", "--seconds=-1"), ("record_carla", "--vehicles=-1"),
     ("pack", "--frames-per-shard=-5"), ("pack", "--workers=-1"), ("voxelize", "--workers=0"),
     ("evaluate", "--windows=-1")])
 def test_a_count_below_zero_is_a_wrong_command_line(command, option, capsys, monkeypatch):

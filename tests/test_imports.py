@@ -14,6 +14,7 @@ BASE = {"types", "config", "geometry", "limits", "ops", "head"}
 ALLOWED = {
     "types": set(),
     "limits": set(),
+    "safetensors_file": set(),
     "geometry": {"limits"},
     "late": set(),
     "config": {"geometry", "limits"},
@@ -26,12 +27,13 @@ ALLOWED = {
     "metrics": BASE | {"nn", "model"},
     "heads": BASE | {"nn", "model", "objectives", "metrics", "viz"},  # imported by none: found by name
     "run": {"types", "config", "model"},
-    "agents": BASE | {"nn", "model", "metrics", "run"},
+    "agents": BASE | {"nn", "model", "metrics", "run", "safetensors_file"},
     "data": BASE,
     "town": BASE | {"data"},
     "recordings": {"config", "data", "town"},
     "viz": BASE,
-    "interop": BASE | {"nn", "model", "objectives", "metrics", "data", "training", "command_line", "late"},
+    "interop": BASE | {"nn", "model", "objectives", "metrics", "data", "training", "command_line", "late",
+                       "safetensors_file"},
     "training": BASE | {"nn", "model", "run", "objectives", "metrics", "data", "recordings"},
 }
 # Inside data: what every format shares, the formats, what finds them, and what makes batches of any of them.

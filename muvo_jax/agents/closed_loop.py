@@ -1,7 +1,8 @@
 """Driving a simulator closed loop: observe, filter, plan in imagination, apply the first action, again.
 
 The simulator comes as functions, so that any one will do; a driver is a function of what it remembers and of the
-simulator's state. `planning_driver` makes one of a world model; the others are what it is measured against.
+simulator's state. `planning_driver` makes one of a world model, `policy_driver` one of a policy that reads its latents;
+the others are what they are measured against.
 """
 
 from __future__ import annotations
@@ -18,7 +19,8 @@ import numpy as np
 
 from muvo_jax.agents import environment as environment_lib
 from muvo_jax.agents import planners
-from muvo_jax.model import glimpse, live
+from muvo_jax.model import checks, glimpse, live
+from muvo_jax.model.world_model import WorldModel
 from muvo_jax.ops import motion as motion_ops
 from muvo_jax.types import Array, ArrayLike, LatentState, Memory, Variables
 
@@ -32,12 +34,15 @@ class Situation:
       collided: whether the car touches something.
       lost: whether it left its route.
       arrived: whether the route is at its end.
+      speed_mps, heading_rad: of the car, for its passengers' comfort; NaN where the simulator does not say.
     """
 
     progress_m: float
     collided: bool = False
     lost: bool = False
     arrived: bool = False
+    speed_mps: float = float("nan")
+    heading_rad: float = float("nan")
 
     @property
     def over(self) -> bool:
@@ -84,6 +89,13 @@ class PlanMemory:
     value: Array
 
 
+@flax.struct.dataclass
+class PolicyMemory:
+    """What a policy's driver remembers: the filter's state, of a batch of one."""
+
+    live: live.LiveState
+
+
 @dataclasses.dataclass(frozen=True)
 class Moment:
     """One step of a drive: the state, the action applied in it, and what the driver remembered then."""
@@ -100,14 +112,19 @@ class Drive:
     Attributes:
       progress_m: metres along the route until the end, or until the collision or the loss of the route.
       steps: that were driven.
-      end: the Situation at the end.
-      moments: its steps.
+      situations: before the first step and after each.
+      moments: its steps; nothing else holds observations.
     """
 
     progress_m: float
     steps: int
-    end: Situation
+    situations: tuple[Situation, ...]
     moments: tuple[Moment, ...]
+
+    @property
+    def end(self) -> Situation:
+        """Where it stood at the end."""
+        return self.situations[-1]
 
     @property
     def unharmed(self) -> bool:
@@ -126,26 +143,37 @@ def drive(simulator: Simulator, driver: Driver, key: Array, seed: int, steps: in
       context: steps before it, in which the expert drives and the driver watches: it is called, its action is not used.
 
     Raises:
-      ValueError: if steps is below 1 or context negative, or the drive is over before the takeover.
+      ValueError: if steps is below 1 or context negative, the drive is over before the takeover, or the driver chooses
+        what is no number, naming the step.
     """
     if steps < 1 or context < 0:
         raise ValueError(f"drive: got steps={steps} and context={context}; expected at least 1 and 0.")
     state, memory, previous = simulator.reset(seed), None, np.zeros(2, np.float32)
     for step in range(context):
-        memory, _ = driver(jax.random.fold_in(key, step), memory, state, previous)
+        memory, unused = driver(jax.random.fold_in(key, step), memory, state, previous)
+        _check_action(unused, seed, step)
         previous = np.asarray(simulator.expert(state), np.float32)
         state = simulator.step(state, previous)
-    now = start = simulator.situation(state)
-    if start.over:
-        raise ValueError(f"drive: with seed {seed} the expert's drive was over before the takeover: {start}.")
+    situations = [simulator.situation(state)]
+    if situations[0].over:
+        raise ValueError(f"drive: with seed {seed} the expert's drive was over before the takeover: {situations[0]}.")
     moments: list[Moment] = []
-    while len(moments) < steps and not now.over:
+    while len(moments) < steps and not situations[-1].over:
         key_step = jax.random.fold_in(key, context + len(moments))
         memory, previous = driver(key_step, memory, state, previous)
+        _check_action(previous, seed, context + len(moments))
         moments.append(Moment(state, previous, memory))
         state = simulator.step(state, previous)
-        now = simulator.situation(state)
-    return Drive(now.progress_m - start.progress_m, len(moments), now, tuple(moments))
+        situations.append(simulator.situation(state))
+    metres = situations[-1].progress_m - situations[0].progress_m
+    return Drive(metres, len(moments), tuple(situations), tuple(moments))
+
+
+def _check_action(action: np.ndarray, seed: int, step: int) -> None:
+    if np.shape(action) != (2,) or not np.isfinite(action).all():
+        raise ValueError(f"drive: with seed {seed}, at step {step} from the first observation on, the driver chose "
+                         f"{np.asarray(action).tolist()}; expected two finite numbers in [-1, 1] (acceleration, "
+                         f"steering).")
 
 
 def planning_driver(simulator: Simulator, environment: environment_lib.Environment, variables: Variables,
@@ -212,13 +240,51 @@ def plan_step(environment: environment_lib.Environment, planner: str, config: pl
     return PlanMemory(filtered, plan.actions, plan.value)
 
 
-def latents(moments: Sequence[Moment]) -> tuple[LatentState, Memory | None, Array]:
-    """The filtered latents [T, ...], what they remember [T, ...] and plans [T, H, 2] of a planned drive."""
+# (key, WorldModel.policy_features [B, P]) -> actions [B, 2] in [-1, 1].
+FeaturePolicy = Callable[[Array, Array], Array]
+
+
+def policy_driver(simulator: Simulator, model: WorldModel, variables: Variables, policy: FeaturePolicy, *,
+                  sampled: bool = False) -> Driver:
+    """Drives by a policy that reads what the model makes of the sensors: filter, act; compiled once.
+
+    Args:
+      simulator: only its `observe` is used; it must give all that the model reads.
+      model, variables: of the run in whose imagination the policy learned.
+      policy: as for Environment.play: (key, model.policy_features [B, P]) -> actions [B, 2], clipped to [-1, 1]. One
+        with parameters comes as jax.tree_util.Partial(function, parameters), as actor_critic.policy makes it, so that
+        new parameters compile nothing anew. Whether it draws its actions or takes its mode is its own affair.
+      sampled: sample the filter's latents instead of taking their means, which is what planning_driver does.
+    """
+    driver_policy = policy if isinstance(policy, jax.tree_util.Partial) else jax.tree_util.Partial(policy)
+
+    def driver(key, memory, state, previous):
+        key_filter, key_policy = jax.random.split(key)
+        stream = live.start_live(model, key_filter) if memory is None else memory.live
+        observation = {name: np.asarray(value)[None] for name, value in simulator.observe(state).items()}
+        stream = live.observe_step(model, variables, stream, observation, previous[None], sampled=sampled)
+        return PolicyMemory(stream), np.asarray(_act(model, driver_policy, key_policy, stream.latent.features)[0])
+
+    return driver
+
+
+@functools.partial(jax.jit, static_argnames=("model",))
+def _act(model: WorldModel, policy: jax.tree_util.Partial, key: Array, features: Array) -> Array:
+    return checks.policy_action(policy(key, model.policy_features(features)), features)
+
+
+def latents(moments: Sequence[Moment]) -> tuple[LatentState, Memory | None]:
+    """The filtered latents [T, ...] of a drive by plans or a policy, and what they remember [T, ...]."""
     stack = lambda *leaves: jnp.concatenate(leaves)
     streams = [moment.memory.live for moment in moments]
     states, memory = (jax.tree.map(stack, *parts) for parts in zip(*((live.latent, live.memory) for live in streams),
                                                                    strict=True))
-    return states, memory, jnp.stack([moment.memory.plan for moment in moments])
+    return states, memory
+
+
+def plans(moments: Sequence[Moment]) -> Array:
+    """The plans [T, H, 2] of a planned drive."""
+    return jnp.stack([moment.memory.plan for moment in moments])
 
 
 def expert_driver(simulator: Simulator) -> Driver:
@@ -236,30 +302,3 @@ def random_driver() -> Driver:
     """A uniform action in [-1, 1] at every step."""
     draw = lambda key: np.asarray(jax.random.uniform(key, (2,), jnp.float32, minval=-1.0))
     return lambda key, memory, state, previous: (memory, draw(key))
-
-
-def summarise(drives: Mapping[str, Sequence[Drive]], expert: str, route_m: float) -> dict[str, dict[str, float]]:
-    """Scores of each driver over drives of the same seeds.
-
-    Args:
-      drives: driver -> its drives, in the order of the seeds.
-      expert: the driver against whose metres progress is measured.
-      route_m: length of a route.
-
-    Returns:
-      driver -> {"success": share of drives without collision or loss of the route, "route_share": mean share of the
-      route driven until then, "collisions", "lost": counts, "progress_m": mean metres, "progress": metres of all drives
-      over the expert's (nan where it stood still), "seconds_share": steps driven over the expert's, "drives": count}.
-    """
-    expert_m = sum(one.progress_m for one in drives[expert])
-    expert_steps = sum(one.steps for one in drives[expert])
-    scores = {}
-    for name, runs in drives.items():
-        metres = sum(one.progress_m for one in runs)
-        scores[name] = {
-            "drives": len(runs), "success": float(np.mean([one.unharmed for one in runs])),
-            "route_share": metres / len(runs) / route_m, "collisions": sum(one.end.collided for one in runs),
-            "lost": sum(one.end.lost for one in runs), "progress_m": metres / len(runs),
-            "progress": metres / expert_m if expert_m > 0 else float("nan"),
-            "seconds_share": sum(one.steps for one in runs) / expert_steps}
-    return scores

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import warnings
 from collections.abc import Callable
 from typing import Any, Literal
 
@@ -17,7 +18,7 @@ import jax.numpy as jnp
 
 from muvo_jax import config as config_lib
 from muvo_jax import run as run_lib
-from muvo_jax.agents import forks, rewards
+from muvo_jax.agents import episodes, forks, rewards
 from muvo_jax.agents import route as route_lib
 from muvo_jax.agents.episodes import EnvParams, EnvState, StartBank, Transition
 from muvo_jax.model import checks
@@ -42,6 +43,7 @@ class Environment:
       reward_function: instead of it, (Moment) -> (reward, terminated, terms); `reward_heads` are decoded for it.
       reward_heads: heads that the reward reads.
       observation: "features" (one vector, model.policy_features) or names of heads, decoded at full size.
+      trained_steps: as many as training imagined, where that is known; `params` warns of longer episodes.
     """
 
     model: WorldModel
@@ -51,6 +53,7 @@ class Environment:
     reward_function: RewardFunction | None = None
     reward_heads: tuple[str, ...] | None = None
     observation: Literal["features"] | tuple[str, ...] = "features"
+    trained_steps: int | None = None
 
     def __post_init__(self):
         heads = self.decoded_heads
@@ -80,6 +83,7 @@ class Environment:
             options["reward_config"] = dataclasses.replace(reward_config, route=run.config.data.route_map)
         if learned_reward:
             options |= {"reward_function": rewards.learned_reward, "reward_heads": rewards.LEARNED_HEADS}
+        options.setdefault("trained_steps", run.config.imagined_steps)
         return cls(run.model, contract=run.contract, periods=run.config.data.stride, **options)
 
     @property
@@ -143,11 +147,15 @@ class Environment:
           skip: frames whose latent has seen too little yet.
 
         Raises:
-          ValueError: if the batch has no speed or no frame is left.
+          ValueError: if the batch has no speed, is not the one that was observed, or no frame is left.
         """
         if batch.speed_mps is None:
             raise ValueError("Environment.starts: Batch.speed_mps is None; imagined drives need the speed at their "
                              "start.")
+        seen, came = observed.states.stochastic.shape[:2], (batch.batch_size, batch.frames)
+        if seen != came:
+            raise ValueError(f"Environment.starts: the observed states are [B, T] = {list(seen)}, the batch is "
+                             f"{list(came)}; pass the batch that `observe` was given.")
         if not 0 <= skip < batch.frames:
             raise ValueError(f"Environment.starts: skip is {skip}, but windows have {batch.frames} frames.")
         merge = lambda leaf: jnp.asarray(leaf[:, skip:]).reshape(-1, *leaf.shape[2:])
@@ -156,18 +164,21 @@ class Environment:
                          None if batch.route_map is None else merge(batch.route_map), observed.memory, rows)
 
     def params(self, variables: Variables, bank: StartBank, horizon: int, temperature: float = 1.0) -> EnvParams:
-        """Checks and packs what the environment runs on.
+        """Checks and packs what the environment runs on. Warns of a horizon longer than training imagined.
+
+        Cars side by side may have horizons of their own: replace max_steps_in_episode by int32 [N], and map it.
 
         Raises:
-          ValueError: for a bank of another model, an empty one, or a horizon below 1.
+          ValueError: for a bank of another model or recording, an empty one, or a horizon below 1.
         """
-        lead = checks.state(self.model, bank.latent)
-        if len(lead) != 1 or bank.size < 1 or lead != bank.speed_mps.shape:
-            raise ValueError(f"StartBank: got states {list(lead)} and speeds {list(bank.speed_mps.shape)}; expected "
-                             f"both [M] with M at least 1.")
+        episodes.check(self.model, bank)
         checks.counts(horizon, None)
-        checks.finite("StartBank", latent=bank.latent, speed_mps=bank.speed_mps)
         checks.finite("params", temperature=temperature)
+        if self.trained_steps is not None and horizon > self.trained_steps and not isinstance(
+                bank.speed_mps, jax.core.Tracer):
+            warnings.warn(f"Environment.params: an episode of {horizon} steps is longer than the {self.trained_steps} "
+                          f"that training imagined. How far this model can be trusted, python -m muvo_jax.evaluate RUN "
+                          f"--uncertainty measures.", stacklevel=2)
         guessed = memory_lib.guessed_heads(self.model.config)
         if not set(guessed).isdisjoint(self.decoded_heads) and (bank.memory is None or bank.row is None):
             raise ValueError(f"StartBank: it has no memory, but the heads {', '.join(guessed)} of this model look at "
@@ -297,8 +308,8 @@ def play(environment: Environment, params: EnvParams, key: Array, state: EnvStat
     Returns the states and Transitions [H, ...]; nothing restarts.
 
     Raises:
-      ValueError: for concrete actions that are not finite, outside [-1, 1] or of another shape, or a state that is not
-        finite.
+      ValueError: for concrete actions that are not finite, outside [-1, 1] or of another shape, a state that is not
+        finite, or a policy that chose what is no number, naming the step.
       TypeError: for forward-mode derivatives through convolutions that have none (ModelConfig.convolution).
     """
     forks.check("play")
@@ -308,7 +319,10 @@ def play(environment: Environment, params: EnvParams, key: Array, state: EnvStat
         checks.action_values(driver, "play")
     checks.finite("play", state=state)
     checks.forward_mode("play", environment.model, params.variables, state, driver)
-    return _play(environment, params, key, state, driver, horizon)
+    played, actions = _play(environment, params, key, state, driver, horizon)
+    if callable(driver):
+        checks.chosen_actions(actions, "play")
+    return played
 
 
 @functools.partial(jax.jit, static_argnames=("environment", "horizon"))
@@ -319,9 +333,8 @@ def _play(environment, params, key, state, driver, horizon):
         if action is None:
             action = driver(key_policy, environment.observe(state, params))
         state, transition = environment.step(key_step, state, action, params)
-        return state, (state, transition)
+        return state, ((state, transition), action)
 
     actions = None if callable(driver) else driver
-    _, (states, transitions) = jax.lax.scan(step, state, (jax.random.split(key, horizon), actions))
-    return states, transitions
+    return jax.lax.scan(step, state, (jax.random.split(key, horizon), actions))[1]
 

@@ -5,8 +5,14 @@ from __future__ import annotations
 from typing import Any
 
 import flax.struct
+import jax
+import jax.numpy as jnp
+import numpy as np
 
 from muvo_jax.agents import route as route_lib
+from muvo_jax.model import checks
+from muvo_jax.model import memory as memory_lib
+from muvo_jax.model.world_model import WorldModel
 from muvo_jax.types import Array, LatentState, Memory, Motion, Variables
 
 
@@ -31,6 +37,33 @@ class StartBank:
     @property
     def size(self) -> int:
         return self.speed_mps.shape[0]
+
+
+def check(model: WorldModel, bank: StartBank) -> None:
+    """Raises ValueError for a bank that this model cannot start from: of another model or recording, or empty."""
+    lead = checks.state(model, bank.latent)
+    if len(lead) != 1 or bank.size < 1 or lead != bank.speed_mps.shape:
+        raise ValueError(f"StartBank: got states {list(lead)} and speeds {list(bank.speed_mps.shape)}; expected "
+                         f"both [M] with M at least 1.")
+    checks.finite("StartBank", latent=bank.latent, speed_mps=bank.speed_mps)
+    maps = bank.route_map
+    if maps is not None and (jnp.ndim(maps) != 3 or maps.shape[0] != bank.size or maps.shape[1] != maps.shape[2]):
+        raise ValueError(f"StartBank: got route maps {list(jnp.shape(maps))}, expected [{bank.size}, 64, 64], one for "
+                         f"each start.")
+    if bank.memory is None or bank.row is None:
+        return
+    memory_lib.check_sizes("StartBank", model.config, bank.memory)
+    windows, frames = bank.memory.pose.shape[:2]
+    indices = {"row": (bank.row, windows)}
+    if bank.latent.vantage is not None:
+        indices["latent.vantage.last"] = bank.latent.vantage.last, frames
+    for name, (index, count) in indices.items():
+        if isinstance(index, jax.core.Tracer):
+            continue
+        if jnp.shape(index) != lead or np.min(index) < 0 or np.max(index) >= count:
+            raise ValueError(f"StartBank: {name} {list(jnp.shape(index))} reaches from {np.min(index)} to "
+                             f"{np.max(index)}, but the memory holds {windows} windows of {frames} observations and "
+                             f"there are {bank.size} starts. States and memory must come from one call of observe.")
 
 
 @flax.struct.dataclass

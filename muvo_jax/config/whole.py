@@ -37,6 +37,12 @@ class Config:
             object.__setattr__(self, "model", dataclasses.replace(self.model, kinematics=wanted))
         self.model.check_motion()
 
+    @property
+    def imagined_steps(self) -> int:
+        """Steps that training imagines from the last observed frame; where it imagines none, as many as evaluation."""
+        length, observed = self.data.frames, self.train.observe_frames
+        return length - observed if 0 < observed < length else self.data.horizon
+
     def to_dict(self) -> dict[str, Any]:
         """Plain JSON types, and the version of their names."""
         return {migration.VERSION_FIELD: migration.VERSION, **dataclasses.asdict(self)}

@@ -17,7 +17,8 @@ from typing import Any
 import numpy as np
 
 from muvo_jax import config as config_lib
-from muvo_jax.interop import safetensors_file, torch_file
+from muvo_jax import safetensors_file
+from muvo_jax.interop import torch_file
 
 _PREFIX = "model."
 _LARGEST_SIZE = 2**13  # of an axis that tells a size; the released models have 2048

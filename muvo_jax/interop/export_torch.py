@@ -15,7 +15,8 @@ from muvo_jax import command_line, late
 with late.imports():
     import jax
 
-    from muvo_jax.interop import names, safetensors_file
+    from muvo_jax import safetensors_file
+    from muvo_jax.interop import names
 
 
 @dataclasses.dataclass(frozen=True)

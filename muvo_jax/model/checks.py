@@ -94,6 +94,23 @@ def action_values(given, where: str) -> None:
                          f"expected [-1, 1] (acceleration, steering; see muvo_jax.config.ActionContract).")
 
 
+def chosen_actions(given, where: str) -> None:
+    """Raises ValueError where a policy chose what is no number, naming the step; traced values pass.
+
+    given: [..., H, 2], steps on the axis before the last.
+    """
+    if isinstance(given, jax.core.Tracer):
+        return
+    values = np.asarray(given)
+    wrong = np.argwhere(~np.isfinite(values).all(axis=-1))
+    if len(wrong):
+        first = wrong[np.argmin(wrong[:, -1])]
+        drive = f" of the drive {first[:-1].tolist()}" if len(first) > 1 else ""
+        raise ValueError(f"{where}: at step {first[-1]}{drive} the policy chose {values[tuple(first)].tolist()}; "
+                         f"expected finite numbers in [-1, 1] (acceleration, steering). Its parameters may be NaN: "
+                         f"lower its learning rate.")
+
+
 def finite(where: str, **named) -> None:
     """Raises ValueError where a concrete array holds NaN or infinity, naming it; traced values and integers pass."""
     for name, tree in named.items():

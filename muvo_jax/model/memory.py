@@ -171,14 +171,8 @@ def check(config: ModelConfig, states: LatentState | Array, memory: Memory | Non
         raise ValueError(f"decode: got {came}{' and no memory' if memory is None else ''}, but the heads {heads} of "
                          f"this model (first_guess='last_seen') look at what was seen of late. Pass states of "
                          f"`observe` or `imagine` and memory=observed.memory (live.memory of a stream).")
-    drives, frames = memory.pose.shape[:2]
-    for name, shape in inputs(config).items():
-        value = getattr(memory, name)
-        expected = (drives, *(() if name in UNTIMED_FIELDS else (frames,)), *shape)
-        if value is None or value.shape != expected:
-            raise ValueError(f"decode: memory.{name} is {None if value is None else list(value.shape)}, expected "
-                             f"{list(expected)} beside memory.pose {list(memory.pose.shape)}; this memory belongs to "
-                             f"another model or is of two.")
+    drives = memory.pose.shape[0]
+    check_sizes("decode", config, memory)
     check_evidence(states, memory)
     flat = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[len(lead):]), states.vantage)
     count = flat.last.shape[0]
@@ -191,6 +185,18 @@ def check(config: ModelConfig, states: LatentState | Array, memory: Memory | Non
         raise ValueError(f"decode: got states [{', '.join(map(str, (*lead, '...')))}] and a memory of {drives} drives; "
                          f"the first axis of the states must count the drives. Pass rows= otherwise.")
     return flat, jnp.repeat(jnp.arange(drives, dtype=jnp.int32), count // drives)
+
+
+def check_sizes(where: str, config: ModelConfig, memory: Memory) -> None:
+    """Raises ValueError where a memory is not of the sizes that a model remembers."""
+    drives, frames = memory.pose.shape[:2]
+    for name, shape in inputs(config).items():
+        value = getattr(memory, name)
+        expected = (drives, *(() if name in UNTIMED_FIELDS else (frames,)), *shape)
+        if value is None or value.shape != expected:
+            raise ValueError(f"{where}: memory.{name} is {None if value is None else list(value.shape)}, expected "
+                             f"{list(expected)} beside memory.pose {list(memory.pose.shape)}; this memory belongs to "
+                             f"another model or recording, or is of two.")
 
 
 def check_evidence(states: LatentState, memory: Memory | None) -> None:

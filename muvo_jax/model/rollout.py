@@ -168,7 +168,8 @@ def imagine(model: WorldModel, variables: Variables, key: jax.Array, state: Late
       same_noise: all branches of a state draw the same noise, so that they differ by their actions alone.
 
     Raises:
-      ValueError: if shapes, values, horizon, branches or key do not fit; the message names what came.
+      ValueError: if shapes, values, horizon, branches or key do not fit; the message names what came. Also where a
+        policy chose what is no number, naming the step.
     """
     lead = checks.state(model, state)
     count = math.prod(lead)
@@ -186,6 +187,8 @@ def imagine(model: WorldModel, variables: Variables, key: jax.Array, state: Late
     flat = jax.tree.map(lambda leaf: leaf.reshape(count, *leaf.shape[len(lead):]), state)
     dream = _imagine(model, variables, keys, flat, driver, jnp.float32(temperature), horizon, branches, sampled,
                      same_noise)
+    if callable(driver):
+        checks.chosen_actions(dream.actions, "imagine")
     return jax.tree.map(lambda leaf: leaf.reshape(*lead, *leaf.shape[1:]), dream)
 
 

@@ -1,16 +1,14 @@
+"""The loop and its drivers, on a road written by hand."""
+
 import dataclasses
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 import worlds
 
-from muvo_jax import command_line, plan_drive, presets
-from muvo_jax import config as config_lib
-from muvo_jax.agents import closed_loop, planners, sensitivity
-from muvo_jax.model import world_model
-from muvo_jax.town import settings
-from muvo_jax.town import simulator as town_lib
+from muvo_jax.agents import closed_loop, planners
 
 STEP_S = 0.2
 FAST = planners.PlannerConfig(plans=8, iterations=2, elites=2, kept=1)
@@ -69,18 +67,6 @@ def test_random_drivers_of_one_key_agree_and_use_each_key_once():
     assert len(np.unique(actions[0])) == actions[0].size and (np.abs(actions) <= 1).all()
 
 
-def test_scores_are_relative_to_the_experts_metres():
-    world = road(wall_m=6.5)
-    drives = {"expert": [run(road(), closed_loop.expert_driver(road()))] * 2,
-              "constant": [run(world, closed_loop.constant_driver((0.0, 0.0))), run(road(), closed_loop.constant_driver(
-                  (0.0, 0.0)))]}
-    scores = closed_loop.summarise(drives, "expert", route_m=50.0)
-    assert scores["expert"]["progress"] == 1.0 and scores["expert"]["success"] == 1.0
-    assert scores["expert"]["route_share"] == pytest.approx(5 * STEP_S * 5 / 50)
-    assert scores["constant"]["success"] == 0.5 and scores["constant"]["collisions"] == 1
-    assert scores["constant"]["progress"] == pytest.approx((5.0 + 5.0) / 10.0)
-
-
 def test_the_planner_filters_every_step_plans_for_progress_and_compiles_once():
     environment, _ = worlds.make()
     world = road()
@@ -93,17 +79,13 @@ def test_the_planner_filters_every_step_plans_for_progress_and_compiles_once():
     assert planned.progress_m > coasting.progress_m  # at 5 m/s, half the limit, imagination pays for accelerating
     again = run(world, driver, steps=6, context=3)
     assert again.progress_m == planned.progress_m
-    states, memory, plans = closed_loop.latents(planned.moments)
+    states, memory = closed_loop.latents(planned.moments)
+    plans = closed_loop.plans(planned.moments)
     assert plans.shape == (6, 4, 2) and states.features.shape[0] == 6 and memory is None
 
 
 def test_the_planner_stops_before_a_wall_unless_collisions_cost_nothing():
-    grid, bare = worlds.CONFIG.range_view, road(wall_m=16.0)
-
-    def observe(state):
-        return bare.observe(state) | {"range_view": np.full((grid.rows, grid.columns, 4), 16.0 - state[0], np.float32)}
-
-    world = dataclasses.replace(bare, observe=observe)
+    world = before_the_wall(16.0)
     config, drives = planners.PlannerConfig(plans=48, iterations=6, std=0.7), {}
     for collision in (5.0, 0.0):
         environment, _ = worlds.before_a_wall(16.0, 5.0, 8, collision=collision)
@@ -112,6 +94,44 @@ def test_the_planner_stops_before_a_wall_unless_collisions_cost_nothing():
     assert drives[0.0].end.collided
     assert drives[5.0].unharmed and drives[5.0].steps == 25
     assert drives[5.0].progress_m > 7.0  # it drove on to where the wall was near
+
+
+def before_the_wall(wall_m):
+    """A road with a wall that worlds.WALL_MODEL sees: all ranges are the distance to it."""
+    grid, bare = worlds.CONFIG.range_view, road(wall_m=wall_m)
+
+    def observe(state):
+        return bare.observe(state) | {"range_view": np.full((grid.rows, grid.columns, 4), wall_m - state[0],
+                                                            np.float32)}
+
+    return dataclasses.replace(bare, observe=observe)
+
+
+def test_a_policy_drives_by_what_the_model_makes_of_the_sensors_and_compiles_once():
+    """The first two features are metres to the wall and speed; the policy wants a third of the metres as m/s."""
+    def wanted(share, key, features):
+        assert features.shape == (1, worlds.WALL_MODEL.policy_feature_channels)
+        return jnp.stack([share * features[:, 0] - features[:, 1], 0.0 * features[:, 0]], axis=-1)
+
+    world, ends, compiled = before_the_wall(16.0), [], []
+    for share in (1 / 3, 1 / 6):
+        driver = closed_loop.policy_driver(world, worlds.WALL_MODEL, {}, jax.tree_util.Partial(wanted, share))
+        done = run(world, driver, steps=25)
+        ends.append(done.moments[-1].state)
+        compiled.append(closed_loop._act._cache_size())
+    assert done.unharmed and done.moments[-1].memory.live.frame == 2 + 25
+    assert ends[0][0] > ends[1][0] + 1.0  # nearer to the wall, and both before it
+    assert all(position < 16.0 for position, _ in ends)
+    assert compiled[0] == compiled[1]
+    assert all((np.abs(moment.action) <= 1.0).all() for moment in done.moments)
+
+
+def test_a_policys_action_that_is_no_number_is_named_with_its_step():
+    world = before_the_wall(16.0)
+    losing = lambda key, features: jnp.where(features[:, :1] < 12.5, jnp.nan, jnp.zeros((1, 2)))
+    driver = closed_loop.policy_driver(world, worlds.WALL_MODEL, {}, losing)
+    with pytest.raises(ValueError, match=r"seed 0, at step 4 .* the driver chose \[nan, nan\]"):
+        run(world, driver)
 
 
 @pytest.mark.parametrize(("options", "message"), [
@@ -123,49 +143,3 @@ def test_what_cannot_be_planned_is_refused(options, message):
     environment, _ = worlds.make()
     with pytest.raises(ValueError, match=message):
         closed_loop.planning_driver(**{"simulator": road(), "environment": environment, "variables": {}} | options)
-
-
-def test_the_town_gives_what_the_model_reads_at_the_models_rate():
-    config = presets.get("tiny")
-    town = town_lib.Town(settings.from_config(config))
-    world = plan_drive.town_simulator(town, config)
-    drive = run(world, closed_loop.expert_driver(world), steps=4, context=1, seed=plan_drive.FIRST_SEED)
-    assert drive.unharmed and drive.progress_m > 1.0
-    state = drive.moments[0].state
-    assert int(world.step(state, drive.moments[0].action).frame) == int(state.frame) + config.data.stride
-    seen = world.observe(state)
-    assert seen["image"].shape == (*config.model.image_size, 3) and seen["image"].dtype == np.uint8
-    assert seen["range_view"].shape == (config.model.range_view.rows, config.model.range_view.columns, 4)
-    assert seen["route_map"].shape == (64, 64)
-    lifted = config_lib.override(config, "model.camera", "bev")
-    assert set(plan_drive.observation(town, state, lifted)) >= set(world_model.inputs(lifted.model))
-
-
-def test_geometry_alone_answers_to_the_wheel_as_the_town_does():
-    config = presets.get("tiny")
-    town = town_lib.Town(settings.from_config(config))
-    world = plan_drive.town_simulator(town, config)
-    states = [world.reset(plan_drive.FIRST_SEED + drive) for drive in range(2)]
-    assert plan_drive.contrast_horizons(config) == (2, 4)
-    pair = sensitivity.CONTRASTS["left or right"]
-    truth = lambda state: plan_drive.town_truth(town, state)
-    shown = [[sensitivity.follow(world, truth, state, action, 2) for state in states] for action in pair]
-    moved = [plan_drive.moved_views(town, config, states, action, 2) for action in pair]
-    for head in ("image", "range_view", "occupancy"):
-        true = [np.stack([frames[head] for frames in drives]) for drives in shown]
-        found = sensitivity.score(head, [frames[head] for frames in moved], true)
-        assert found["gain"] > 0.1 and found["correlation"] > 0.1, (head, found)
-
-
-def test_help_shows_examples_and_explains_every_option(capsys):
-    with pytest.raises(SystemExit) as ended:
-        command_line.run(plan_drive.Options, lambda *_: None, program="plan_drive", arguments=["--help"],
-                         examples=plan_drive.EXAMPLES)
-    text = capsys.readouterr().out
-    assert ended.value.code == 0 and text.count("python -m muvo_jax.plan_drive ") >= 3 and "None" not in text
-
-
-def test_icem_is_cem_with_kept_elites():
-    name, improved = plan_drive.planner_of(plan_drive.Options(run="r"))
-    plain_name, plain = plan_drive.planner_of(plan_drive.Options(run="r", planner="cem"))
-    assert name == plain_name == "cem" and improved.kept > 0 and plain.kept == 0 and plain.noise_exponent == 0

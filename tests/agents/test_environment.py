@@ -1,6 +1,7 @@
 """The core environment: starts, steps, ends, observations."""
 
 import dataclasses
+import warnings
 
 import jax
 import jax.numpy as jnp
@@ -10,9 +11,11 @@ from worlds import CONFIG, HORIZON, MODEL, NO_COLLISION, STARTS, bank, make, var
 
 from muvo_jax import config as config_lib
 from muvo_jax import presets
+from muvo_jax import run as run_lib
 from muvo_jax.agents import environment as environment_lib
-from muvo_jax.agents import rewards
-from muvo_jax.model import rollout, world_model
+from muvo_jax.agents import episodes, rewards
+from muvo_jax.model import checks, rollout, world_model
+from muvo_jax.model import memory as memory_lib
 from muvo_jax.types import Batch, Observed
 
 ACTION = jnp.array([0.5, -0.2])
@@ -58,22 +61,24 @@ def test_the_2d_latent_is_driven_by_a_policy_that_reads_one_vector():
     assert np.isfinite(transitions.reward).all() and states.time.tolist() == [1, 2]
 
 
-def test_many_cars_restart_one_by_one():
+def test_many_cars_restart_one_by_one_at_horizons_of_their_own():
     environment, params = make()
     keys = jax.random.split(jax.random.key(0), 6)
     _, states = jax.vmap(environment.reset, (0, None))(keys, params)
     assert len(np.unique(states.start)) > 1 and states.start.max() < STARTS
     states = dataclasses.replace(states, time=jnp.array([0, 1, 2, 2, 1, 0]))
+    params = dataclasses.replace(params, max_steps_in_episode=jnp.array([3, 3, 3, 3, 9, 1]))
+    mapped = environment_lib.EnvParams(None, None, 0, None)
 
     @jax.jit
     def advance(keys, states):
-        after, transition = jax.vmap(environment.step, (0, 0, None, None))(keys, states, ACTION, params)
-        return transition, jax.vmap(environment.restart, (0, 0, 0, 0, None))(
+        after, transition = jax.vmap(environment.step, (0, 0, None, mapped))(keys, states, ACTION, params)
+        return transition, jax.vmap(environment.restart, (0, 0, 0, 0, mapped))(
             keys, after, transition.observation, transition.final, params)
 
     transition, (after, seen) = advance(keys, states)
-    assert transition.truncated.tolist() == [False, False, True, True, False, False]
-    assert after.time.tolist() == [1, 2, 0, 0, 2, 1]
+    assert transition.truncated.tolist() == [False, False, True, True, False, True]
+    assert after.time.tolist() == [1, 2, 0, 0, 2, 0]
     assert not np.allclose(seen[2], transition.observation[2])
     np.testing.assert_array_equal(seen[0], transition.observation[0])
 
@@ -112,6 +117,8 @@ def test_the_bank_holds_every_frame_after_the_first_ones():
     assert made.size == 4 and made.speed_mps.tolist() == [1, 2, 4, 5] and made.route_map is None
     with pytest.raises(ValueError, match="skip is 3"):
         environment_lib.Environment.starts(Observed(states, None, None), batch, skip=3)
+    with pytest.raises(ValueError, match=r"observed states are \[B, T\] = \[2, 3\], the batch is \[1, 3\]"):
+        environment_lib.Environment.starts(Observed(states, None, None), batch[:1])
 
 
 def test_what_does_not_fit_is_refused():
@@ -132,3 +139,53 @@ def test_what_does_not_fit_is_refused():
     none = dataclasses.replace(environment.contract, kinematics="none")
     with pytest.raises(ValueError, match="or pass a reward_function"):
         dataclasses.replace(environment, contract=none)
+
+
+def with_memory(windows=2, starts=STARTS):
+    """A model with a memory, and a bank of states that were observed in windows of four frames."""
+    model = world_model.WorldModel(config_lib.override_all(presets.get("tiny"), {
+        "model.first_guess": "last_seen", "model.heads": ("occupancy", "action")}).model)
+    latent, places = model.initial_state(starts), memory_lib.stream_places(model.config)
+    rows = jnp.arange(starts, dtype=jnp.int32) % windows
+    return model, environment_lib.StartBank(latent, jnp.ones(starts), bank().route_map[:starts], memory_lib.empty(
+        model.config, windows), rows), places
+
+
+def test_a_bank_of_another_recording_is_refused():
+    model, good, places = with_memory()
+    episodes.check(model, good)
+    scans = good.memory.range_view
+    other = dataclasses.replace(good.memory, range_view=jnp.repeat(scans, 2, axis=3))  # a lidar with more columns
+    with pytest.raises(ValueError, match=r"StartBank: memory.range_view .* belongs to another model or recording"):
+        episodes.check(model, dataclasses.replace(good, memory=other))
+    with pytest.raises(ValueError, match=rf"row \[5\] reaches from 0 to 2, .* 2 windows of {places} observations"):
+        episodes.check(model, dataclasses.replace(good, row=jnp.arange(STARTS) % 3))
+    late = dataclasses.replace(good.latent.vantage, last=jnp.full(STARTS, places))
+    with pytest.raises(ValueError, match=r"latent\.vantage\.last .* one call of observe"):
+        episodes.check(model, dataclasses.replace(good, latent=dataclasses.replace(good.latent, vantage=late)))
+    with pytest.raises(ValueError, match=r"got route maps \[3, 64, 64\], expected \[5, 64, 64\]"):
+        episodes.check(model, dataclasses.replace(good, route_map=good.route_map[:3]))
+
+
+def test_episodes_longer_than_training_imagined_are_warned_of():
+    run = run_lib.Run(MODEL, variables(), presets.get("tiny"))
+    environment = environment_lib.Environment.of_run(run, reward_config=NO_COLLISION)
+    steps = run.config.imagined_steps
+    assert environment.trained_steps == steps == 2
+    with pytest.warns(UserWarning, match=r"an episode of 3 steps is longer than the 2 that training imagined\..*"
+                                         r"evaluate RUN --uncertainty"):
+        environment.params(variables(), bank(), steps + 1)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        environment.params(variables(), bank(), steps)
+
+
+def test_a_policy_that_loses_its_numbers_is_named_with_its_step():
+    environment, params = make()
+    _, state = environment.reset(jax.random.key(0), params)
+    speeds = lambda key, seen: jnp.where(jax.random.key_data(key)[0] % 2 == 0, jnp.nan, jnp.zeros(2))
+    with pytest.raises(ValueError, match=r"play: at step \d the policy chose \[nan, nan\]; expected finite"):
+        environment_lib.play(environment, params, jax.random.key(1), state, jax.tree_util.Partial(speeds), 8)
+    lost = jnp.zeros((2, 3, 4, 2)).at[1, 2, 3, 0].set(jnp.nan).at[1, 0, 1, 1].set(jnp.inf)
+    with pytest.raises(ValueError, match=r"imagine: at step 1 of the drive \[1, 0\] the policy chose \[0.0, inf\]"):
+        checks.chosen_actions(lost, "imagine")

@@ -178,7 +178,7 @@ def test_gymnasium_environments_travel_and_refuse_nan(world):
 
     door = gymnasium_env.GymnasiumImagination(*world)
     door.reset(seed=0)
-    with pytest.raises(ValueError, match=r"GymnasiumImagination.step: action \[2\] holds 1 values"):
+    with pytest.raises(ValueError, match=r"Imagination.step: at step 0 of the episode the action is \[nan, 0.0\]"):
         door.step(np.array([NAN, 0.0]))
     again = pickle.loads(pickle.dumps(door))
     for action in (np.zeros(2), np.array([3.0, -3.0])):  # what is outside [-1, 1] is clipped

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 import torch_writer
 
-from muvo_jax import presets, train
-from muvo_jax.interop import backbones, safetensors_file, weights_rule
+from muvo_jax import presets, safetensors_file, train
+from muvo_jax.interop import backbones, weights_rule
 from muvo_jax.interop.parity import golden
 from muvo_jax.model import world_model
 from muvo_jax.training import optimizer, preparation, state

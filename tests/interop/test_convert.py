@@ -11,8 +11,8 @@ import torch_writer
 
 import muvo_jax
 from muvo_jax import config as config_lib
-from muvo_jax import convert, dream, evaluate, presets, train
-from muvo_jax.interop import checkpoints, export_torch, names, safetensors_file, weights_rule
+from muvo_jax import convert, dream, evaluate, presets, safetensors_file, train
+from muvo_jax.interop import checkpoints, export_torch, names, weights_rule
 from muvo_jax.interop.parity import golden
 from muvo_jax.model import world_model
 from muvo_jax.training import checkpoint, screen

@@ -12,7 +12,8 @@ import numpy as np
 import pytest
 import torch_writer
 
-from muvo_jax.interop import safetensors_file, torch_file
+from muvo_jax import safetensors_file
+from muvo_jax.interop import torch_file
 
 WRITERS = {"zip": torch_writer.write_zip, "legacy": torch_writer.write_legacy}
 ARRAYS = {"float32": np.arange(12, dtype=np.float32).reshape(3, 4), "float16": np.float16([[1.5, -2.0]]),

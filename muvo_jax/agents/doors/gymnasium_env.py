@@ -11,7 +11,6 @@ import numpy as np
 from muvo_jax.agents import environment as environment_lib
 from muvo_jax.agents import forks
 from muvo_jax.agents.doors import optional
-from muvo_jax.model import checks
 
 gymnasium: Any = optional.need("gymnasium", "gymnasium")
 Functional: Any = optional.need("gymnasium.experimental.functional", "gymnasium").FuncEnv
@@ -90,7 +89,9 @@ class GymnasiumImagination(Env):
             raise ValueError("GymnasiumImagination.step before reset.")
         forks.check("GymnasiumImagination.step")
         action = np.asarray(action, np.float32)
-        checks.finite("GymnasiumImagination.step", action=action)  # what is outside [-1, 1] is clipped
+        if not np.isfinite(action).all():  # what is outside [-1, 1] is clipped
+            raise ValueError(f"GymnasiumImagination.step: at step {int(self._state.time)} of the episode the action is "
+                             f"{action.tolist()}; expected two finite numbers in [-1, 1] (acceleration, steering).")
         self._state, transition = self._step(self._key(), self._state, action, self.params)
         transition = jax.device_get(transition)
         info = {name: float(value) for name, value in transition.terms.items()}

@@ -61,12 +61,13 @@ def load(run, checkpoint="latest"):
     """Loads a trained run: `load("runs/town-tr") -> Run`.
 
     Args:
-      run: folder that `python -m muvo_jax.train` wrote.
-      checkpoint: "latest", "best" (by validation loss) or a step.
+      run: folder that `python -m muvo_jax.train` wrote, or "builtin:town", a trained model that ships with the package.
+      checkpoint: "latest", "best" (skill of imagined frames) or a step.
 
     Raises:
       muvo_jax.training.checkpoint.CheckpointError: if there is no such run or checkpoint, or none that can be read.
-      ValueError: if another version wrote it, with a schema or settings that this one does not know.
+      ValueError: if another version wrote it, with a schema or settings that this one does not know, or if no model of
+        that name ships.
     """
     from muvo_jax.training.checkpoint import load_run  # imported late: imagining needs no checkpoint library
 

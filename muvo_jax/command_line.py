@@ -205,7 +205,7 @@ def which_checkpoint(text: str) -> str | int:
     raise ValueError(f"--checkpoint: got {text!r}, expected latest, best or a step such as 400.")
 
 
-def open_data(config: config_lib.Config, show: screen.Screen) -> schema.Recording:
-    """The recording that a config names, with a progress bar where the town is recorded."""
+def open_data(config: config_lib.Config, show: screen.Screen, split: str | None = None) -> schema.Recording:
+    """The recording that a config names, or one split of it, with a progress bar where the town is recorded."""
     with show.counter("recording the built-in town", "frames") as progress:
-        return recordings.open_configured(config, progress)
+        return recordings.open_configured(config, progress, split=split)

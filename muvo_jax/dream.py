@@ -16,7 +16,7 @@ with late.imports():
     import jax
 
     from muvo_jax import config as config_lib
-    from muvo_jax import evaluate, types
+    from muvo_jax import evaluate, recordings, types
     from muvo_jax.data import pipeline, schema, windows
     from muvo_jax.data import prepare as prepare_lib
     from muvo_jax.metrics import baselines, protocol, warp
@@ -73,7 +73,7 @@ def dream(options: Options, show: screen.Screen) -> list[pathlib.Path]:
     fields = {"data": "data.path", "context": "data.context", "horizon": "data.horizon"}
     chosen = command_line.chosen_settings(options, fields)
     config = config_lib.override_all(loaded.config, chosen)
-    recording = command_line.open_data(config, show)
+    recording = command_line.open_data(config, show, options.split or recordings.HELD_OUT)
     config = evaluate.fit(config, recording, tuple(chosen))
     window = choose_window(recording, config, options)
     batch = pipeline.Frames(recording, config).batch([window], judged=True)

@@ -94,6 +94,7 @@ def _error_name(head: str) -> str:
 
 def write_report(folder: pathlib.Path, report: Mapping[str, Any], suffix: str = "") -> tuple[pathlib.Path, ...]:
     """Writes RUN/evaluation.json (not-a-number as the string "nan") and RUN/report.md; returns their paths."""
+    folder.mkdir(parents=True, exist_ok=True)
     numbers, page = folder / f"evaluation{suffix}.json", folder / f"report{suffix}.md"
     numbers.write_text(json.dumps(json_ready(report), indent=1) + "\n", encoding="utf-8")
     page.write_text(markdown(report), encoding="utf-8")

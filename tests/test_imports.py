@@ -34,7 +34,8 @@ ALLOWED = {
     "viz": BASE,
     "interop": BASE | {"nn", "model", "objectives", "metrics", "data", "training", "command_line", "late",
                        "safetensors_file"},
-    "training": BASE | {"nn", "model", "run", "objectives", "metrics", "data", "recordings"},
+    "training": BASE | {"nn", "model", "run", "objectives", "metrics", "data", "recordings",
+                        "safetensors_file"},
 }
 # Inside data: what every format shares, the formats, what finds them, and what makes batches of any of them.
 RECORDED = {"errors", "fields", "words", "schema", "sequences", "files", "description", "runs", "ego_motion",

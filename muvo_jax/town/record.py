@@ -65,7 +65,8 @@ def jobs(size: str) -> list[TownDrive]:
             for restless in [index >= plan.runs - plan.restless]]
 
 
-def cached_town(config: config_lib.Config, progress: Progress | None = None) -> pathlib.Path:
+def cached_town(config: config_lib.Config, progress: Progress | None = None, *,
+                split: str | None = None) -> pathlib.Path:
     """Returns the folder of the recording that `config` asks for, recording what is missing of it first.
 
     It lies in $XDG_CACHE_HOME (or ~/.cache) under muvo_jax/town-<hash of everything that decides its content>.
@@ -73,12 +74,19 @@ def cached_town(config: config_lib.Config, progress: Progress | None = None) -> 
     Args:
       config: data.town_size, data.town_seed, the model's sensors and the action contract are used.
       progress: called with (frames done, frames in all) now and then.
+      split: record no other than this one.
+
+    Raises:
+      ValueError: for a size or split that does not exist.
     """
     town_config = settings.from_config(config)
     cache = pathlib.Path(os.environ.get("XDG_CACHE_HOME") or pathlib.Path.home() / ".cache")
     directory = cache / "muvo_jax" / f"town-{fingerprint(town_config, config.data.town_size)}"
+    known = settings.SIZES[config.data.town_size]
+    if split is not None and split not in known:
+        raise ValueError(f"the town has no split {split!r}; it has {', '.join(known)}.")
     if not (directory / COMPLETE_FILE).is_file():
-        record_town(directory, town_config, config.data.town_size, progress=progress)
+        record_town(directory, town_config, config.data.town_size, progress=progress, split=split)
     return directory
 
 
@@ -95,8 +103,9 @@ def fingerprint(town_config: settings.TownConfig, size: str) -> str:
 
 
 def record_town(directory: pathlib.Path | str, town_config: settings.TownConfig, size: str = "default", *,
-                progress: Progress | None = None, workers: int | None = None) -> pathlib.Path:
-    """Records all splits of a size into `directory`; complete runs that are there already are kept.
+                progress: Progress | None = None, workers: int | None = None,
+                split: str | None = None) -> pathlib.Path:
+    """Records all splits of a size, or one, into `directory`; complete runs that are there already are kept.
 
     Args:
       workers: processes; by default one for each processor, none for small recordings.
@@ -107,7 +116,7 @@ def record_town(directory: pathlib.Path | str, town_config: settings.TownConfig,
       RuntimeError: where a worker failed; its message is included.
     """
     directory = pathlib.Path(directory)
-    planned = jobs(size)
+    planned = [job for job in jobs(size) if split in (None, job.split)]
     describe(directory, town_config, tuple(settings.SIZES[size]))
     with processes.locked(directory / ".lock", "recording", wait=True):
         missing = [job for job in planned if not plain_writer.is_complete(directory, job.split, job.run)]
@@ -121,8 +130,9 @@ def record_town(directory: pathlib.Path | str, town_config: settings.TownConfig,
             done += count
             if progress is not None:
                 progress(done, total)
-        files.write_atomically(directory / COMPLETE_FILE,
-                               json.dumps({"frames": total, "version": RECORDING_VERSION}))
+        if split is None:
+            files.write_atomically(directory / COMPLETE_FILE,
+                                   json.dumps({"frames": total, "version": RECORDING_VERSION}))
     return directory
 
 

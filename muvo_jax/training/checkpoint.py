@@ -23,7 +23,7 @@ from muvo_jax import config as config_lib
 from muvo_jax import run as run_lib
 from muvo_jax import types
 from muvo_jax.model import world_model
-from muvo_jax.training import checkpoint_meta, integrity
+from muvo_jax.training import builtin, checkpoint_meta, integrity
 
 FOLDER = "checkpoints"
 _preservation = ocp.checkpoint_managers
@@ -196,13 +196,18 @@ def load_run(run: str | os.PathLike, which: int | str = "latest") -> run_lib.Run
     """Loads a trained model for inference onto the first device, wherever it was trained.
 
     Args:
-      run: a run's folder.
+      run: a run's folder, or "builtin:town" (training/builtin.py).
       which: "latest", "best" (highest validation score) or a step.
 
     Raises:
       CheckpointError: where there is no run, no such checkpoint, or none that can be read.
-      ValueError: where it was written by a version with an unknown schema or configuration.
+      ValueError: where it was written by a version with an unknown schema or configuration, or ships with none.
     """
+    if (name := builtin.named(run)) is not None:
+        shipped = builtin.load(name)
+        if which not in ("latest", "best", shipped.step):
+            raise CheckpointError(f"{builtin.PREFIX}{name} has step {shipped.step} alone, not {which}.")
+        return shipped
     folder = pathlib.Path(run).expanduser().resolve()
     checkpoints = folder / FOLDER
     found = _steps(checkpoints)

@@ -81,7 +81,7 @@ def windows_of_run(run: run_lib.Run | str | os.PathLike, split: str | None = Non
                    frames: int | None = None) -> types.Batch:
     """See muvo_jax.windows."""
     config = (run if isinstance(run, run_lib.Run) else checkpoint.load_run(run)).config
-    recording = recordings.open_configured(config)
+    recording = recordings.open_configured(config, split=split or recordings.HELD_OUT)
     held_out = [name for name in recording.description.splits if name != "train"]
     split = split or (held_out or ["train"])[0]
     entry = next(pipeline.evaluation_batches(pipeline.Frames(recording, fitting.adapt(config, recording).config), split,

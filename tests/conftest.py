@@ -21,3 +21,12 @@ def strict_dtypes():
     """Implicit dtype promotion raises inside tests of float32 code (ops, model, objectives)."""
     with jax.numpy_dtype_promotion("strict"):
         yield
+
+
+@pytest.fixture(scope="module")
+def fast_compilation():
+    """For slow tests that are compilation above all and ask nothing of an optimised program."""
+    before = jax.config.read("jax_disable_most_optimizations")
+    jax.config.update("jax_disable_most_optimizations", True)
+    yield
+    jax.config.update("jax_disable_most_optimizations", before)

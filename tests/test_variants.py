@@ -9,7 +9,6 @@ occupancy decoder others have too go without it.
 import itertools
 import json
 
-import jax
 import pytest
 
 from muvo_jax import command_line, presets, train
@@ -33,14 +32,6 @@ def town(tmp_path_factory):
         yield cache
 
 
-@pytest.fixture(scope="module", autouse=True)
-def fast_compilation():
-    before = jax.config.read("jax_disable_most_optimizations")
-    jax.config.update("jax_disable_most_optimizations", True)
-    yield
-    jax.config.update("jax_disable_most_optimizations", before)
-
-
 def test_the_cases_have_every_pair():
     parts = [(*variant.lower().split("-"), latent) for variant, latent in [*CASES, ("RV-WOB-TR", "1d")]]
     axes = (config_lib.LIDARS, config_lib.CAMERAS, config_lib.FUSIONS, config_lib.LATENTS)
@@ -51,6 +42,7 @@ def test_the_cases_have_every_pair():
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("fast_compilation")
 @pytest.mark.parametrize(("variant", "latent"), CASES)
 def test_variant_trains_evaluates_and_dreams(variant, latent, town, tmp_path):
     del town

@@ -259,7 +259,7 @@ def _content(rig: Rig, frame: Frame) -> bytes:
         keep: Callable[[np.ndarray], np.ndarray] = _without_own_car
         depth_m, points_m = np.where(depth < 1.0, depth * muvo_files.DEPTH_RANGE_M, np.inf), scan.points_m
     else:
-        depth_m = plain_reader.decode_depth(files.read_image(frame.depth, None))
+        depth_m = files.read_image(frame.depth, "depth_m")
         points_m = files.read_npz(frame.points, "points_m").astype(np.float32)
         if depth_m.ndim != 2 or points_m.shape[1:] != (3,):
             raise schema.DataError(f"{frame.depth}, {frame.points}: depth of shape {list(depth_m.shape)}, points of "

@@ -38,12 +38,11 @@ from muvo_jax.data.plain import frames_table
 SCHEMA_VERSION = 1
 DESCRIPTION_FILE = "recording.toml"
 FRAMES_FILE = frames_table.FRAMES_FILE
-DEPTH_UNIT_M = 0.01
-DEPTH_SKY = 65535
+DEPTH_UNIT_M, DEPTH_SKY, decode_depth = files.DEPTH_UNIT_M, files.DEPTH_SKY, files.decode_depth
 _DIGITS = 6
 _NEEDED = frozenset(("speed_mps", "action", "timestamp_s", "frame_id"))
 _TOP_LEVEL = ("schema_version", "name", "rate_hz", "splits", "classes")
-_MODES = {"image": "RGB", "route_map": "L", "image_classes": "classes", "depth_m": "depth"}
+_MODES = {"image": "RGB", "route_map": "L", "image_classes": "classes", "depth_m": "depth_m"}
 _OF_IMAGE = ("intrinsics", "camera_to_ego")
 
 
@@ -173,7 +172,6 @@ class PlainRecording:
             values = files.read_npz(path, field.array)
         else:
             values = files.read_image(path, _MODES[name])
-            values = decode_depth(values) if name == "depth_m" else values
         camera, grid = described.camera, described.voxels
         sizes: dict[str, int | None] = dict.fromkeys("HWNXYZ")
         if camera is not None:
@@ -231,11 +229,6 @@ class PlainRecording:
         pieces = sequences.gap_free(present, late | restarts)
         sequences.warn_of_gaps(str(run.folder), present, absent, late & ~restarts, len(pieces))
         return [schema.Sequence(run.split, run.name, start, length, lacks) for start, length in pieces]
-
-
-def decode_depth(pixels: np.ndarray) -> np.ndarray:
-    """Centimetres (16 bit) to float32 metres, infinite in the sky; the inverse of writer.encode_depth."""
-    return np.where(pixels == DEPTH_SKY, np.float32(np.inf), pixels.astype(np.float32) * np.float32(DEPTH_UNIT_M))
 
 
 def read_header(root: pathlib.Path) -> dict:

@@ -26,7 +26,7 @@ BAD_POINT_SHARE = 0.01  # more non-finite points than this are a broken file, no
 DEPTH_UNIT_M, DEPTH_SKY = 0.01, 65535  # of pictures of depth
 PICTURE_FORMATS = ("PNG", "JPEG")  # as Pillow names them
 PICTURE_MODES = ("RGB", "RGBA", "L", "classes", "depth_m")
-_NOT_FRAMES = ("Thumbs.db", "desktop.ini")
+_NOT_FRAMES = ("Thumbs.db", "desktop.ini", "rule.json")  # the last one is voxelizing.RULE_FILE
 # Pillow raises any of these for broken chunks and for sizes that would fill the memory.
 _IMAGE_ERRORS = (OSError, SyntaxError, ValueError, TypeError, IndexError, OverflowError, MemoryError, zlib.error,
                  struct.error, Image.DecompressionBombError)

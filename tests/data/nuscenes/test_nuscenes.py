@@ -16,6 +16,7 @@ from muvo_jax.data import fitting, prepare, schema, sequences, sources
 from muvo_jax.data.nuscenes import reader, scans, scene_splits, tables
 from muvo_jax.data.packed import reader as packed_reader
 from muvo_jax.data.packed import writer as packed_writer
+from muvo_jax.data.plain import writer as plain_writer
 from muvo_jax.ops import camera as camera_ops
 from muvo_jax.training import screen
 
@@ -396,6 +397,29 @@ def test_packs_hold_the_same_frames_and_follow_what_is_corrected(root, tmp_path)
     again = {path.name: path.stat().st_mtime_ns for path in out.glob("*.arrayrecord")}
     assert [again[name] == made[name] for name in sorted(made)] == [True, False]
     assert len(packed_reader.PackedRecording(out).read(source.sequences[1], 0)["points_m"]) == 1
+
+
+def test_a_plain_copy_has_the_camera_of_each_frame_and_scene(root, tmp_path):
+    source = opened(root, key_frames=True)
+    described = source.description
+    plain_writer.write_description(tmp_path / "copy", name="copy", rate_hz=described.rate_hz, splits=described.splits,
+                                   camera=described.camera, lidar=described.lidar, contract=described.contract)
+    for sequence in source.sequences:
+        run = plain_writer.RunWriter(tmp_path / "copy", sequence.split, sequence.name)
+        for index in range(sequence.length):
+            run.write(source.read(sequence, index))
+        run.close()
+    copy = opened(tmp_path / "copy")
+    assert copy.description == dataclasses.replace(described, name="copy", kind="plain", notes=())
+    for ours, theirs in zip(copy.sequences, source.sequences, strict=True):
+        for index in range(theirs.length):
+            expected, frame = source.read(theirs, index), copy.read(ours, index)
+            assert expected.keys() == frame.keys()
+            for name, value in expected.items():
+                np.testing.assert_array_equal(frame[name], value, err_msg=name)
+    first, second = (copy.read(sequence, 1) for sequence in copy.sequences)
+    assert first["intrinsics"][0, 0] + 1 == second["intrinsics"][0, 0]  # of the cars of the two scenes
+    assert first["camera_to_ego"][0, 3] != np.float32(described.camera.camera_to_ego[0][3])
 
 
 def test_the_doctor_takes_missing_archives_for_no_fault(tmp_path, capsys):

@@ -441,6 +441,26 @@ def test_frames_are_what_a_model_eats(root):
     assert {0, 1, 255} == set(np.unique(frame["occupancy"]))
 
 
+def test_every_row_of_the_town_presets_range_view_is_one_beam(root):
+    """Points in the middle of the lidar's 32 beams, all around: each lies in a row of its own, and none is empty."""
+    recording = opened(root)
+    elevations_rad = np.radians(np.linspace(-92 / 3, 32 / 3, 32))
+    azimuths_rad = np.radians(np.arange(0.0, 360.0))
+    elevation_rad, azimuth_rad = (values.ravel() for values in np.meshgrid(elevations_rad, azimuths_rad, indexing="ij"))
+    flat_m = 9.0 * np.cos(elevation_rad)
+    points = np.stack([flat_m * np.cos(azimuth_rad), flat_m * np.sin(azimuth_rad), 9.0 * np.sin(elevation_rad),
+                       np.full(len(flat_m), 17.0), np.repeat(np.arange(32), len(azimuths_rad))], axis=1)
+    points.astype(np.float32).tofile(root / f"samples/LIDAR_TOP/n000__LIDAR_TOP__{writer.START_US}.pcd.bin")
+    config, notes = fitting.adapt(presets.get("town"), recording)
+    assert config.model.range_view.rows == 32
+    assert "range views have 32 rows instead of 64: the lidar has 32, and more would be empty." in notes
+    view = prepare.prepare_frame(recording.read(recording.sequences[0], 0), config)["range_view"]
+    ranges_m = view[..., 3]
+    assert (ranges_m > 0).mean() > 0.9 and (ranges_m > 0).any(axis=1).all()
+    seen_rad = np.arcsin((view[..., 2] - 1.84) / np.where(ranges_m > 0, ranges_m, np.nan))
+    np.testing.assert_allclose(np.nanmean(seen_rad, axis=1), elevations_rad[::-1], atol=1e-3)
+
+
 def test_a_scene_is_made_of_its_own_files_and_the_tables(root):
     listed = reader.NuScenesRecording(root).run_files("scene-0103")
     assert len(set(listed)) == len(tables.NAMES) + 21 + 21 and all(path.is_file() for path in listed)

@@ -104,7 +104,7 @@ def fit(config: config_lib.Config, recording, chosen: tuple[str, ...]) -> config
     Raises:
       ValueError: naming both where the recording asks for another network.
     """
-    fitted = fitting.adapt(config, recording, keep=chosen).config
+    fitted = fitting.adapt(config, recording, keep=(*chosen, *fitting.OF_TRAINED)).config
     where = f"recording {recording.description.name!r} asks for another model than this run, which"
     checkpoint_meta.check_architecture(fitted, config, where)
     return fitted

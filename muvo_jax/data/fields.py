@@ -34,7 +34,7 @@ class Field:
       is_sensor: what a model sees; see runs.shared.
       folder, suffixes: of its files in the plain format, the first suffix being the one that is written.
       array: its name inside an NPZ file.
-      columns: of frames.csv, in the plain format.
+      columns: of frames.csv, in the plain format; of a matrix row by row, without the last row.
       required: whether frames.csv must have them.
     """
 
@@ -53,14 +53,31 @@ class Field:
     columns: tuple[str, ...] = ()
     required: bool = False
 
+    def to_cells(self, value: np.ndarray) -> np.ndarray:
+        """The numbers of its columns [C]: all of them, but of a matrix not the last row, which is 0 ... 0 1."""
+        return np.atleast_1d(value).ravel()[:len(self.columns)]
+
+    def of_cells(self, values: Any) -> Any:
+        """The inverse: an array, or a number where the field is one."""
+        if not self.shape:
+            return self.dtype(values[0])
+        shape: Any = self.shape  # () or of numbers: what has columns has no letters
+        last_row = np.eye(*shape)[-1] if len(shape) == 2 else ()
+        return np.array([*values, *last_row], self.dtype).reshape(shape)
+
+
+def _matrix(name: str, rows: int, columns: int) -> tuple[str, ...]:
+    return tuple(f"{name}_{row}{column}" for row in range(1, rows + 1) for column in range(1, columns + 1))
+
 
 _COMMAND = between(0, 5)
 _TARGET_M = between(-1e5, 1e5, "m")
 _IMAGES = (".png", ".jpg", ".jpeg")
 TABLE = (
     Field("image", np.uint8, ("H", "W", 3), is_sensor=True, folder="image", suffixes=_IMAGES),
-    Field("intrinsics", np.float32, (3, 3), "px"),
-    Field("camera_to_ego", np.float32, (4, 4), "m"),
+    # In frames.csv where a frame's are others than the description's.
+    Field("intrinsics", np.float32, (3, 3), "px", columns=_matrix("intrinsics", 2, 3)),
+    Field("camera_to_ego", np.float32, (4, 4), "m", columns=_matrix("camera_to_ego", 3, 4)),
     Field("points_m", np.float32, ("N", 3), "m", between(-1e5, 1e5, "m"), finite=False, is_sensor=True,
           folder="lidar", suffixes=(".npz",), array="points_m"),
     Field("occupancy", np.uint8, ("X", "Y", "Z"), values=(0, 1, UNKNOWN), folder="occupancy", suffixes=(".npz",),

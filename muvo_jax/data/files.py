@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import contextvars
 import io
 import json
 import os
@@ -12,7 +14,8 @@ import tomllib
 import warnings
 import zipfile
 import zlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from typing import NamedTuple
 
 import numpy as np
 from PIL import Image, ImageOps
@@ -20,7 +23,10 @@ from PIL import Image, ImageOps
 from muvo_jax.data import schema
 
 BAD_POINT_SHARE = 0.01  # more non-finite points than this are a broken file, not noise
-_NOT_FRAMES = ("Thumbs.db", "desktop.ini")
+DEPTH_UNIT_M, DEPTH_SKY = 0.01, 65535  # of pictures of depth
+PICTURE_FORMATS = ("PNG", "JPEG")  # as Pillow names them
+PICTURE_MODES = ("RGB", "RGBA", "L", "classes", "depth_m")
+_NOT_FRAMES = ("Thumbs.db", "desktop.ini", "rule.json")  # the last one is voxelizing.RULE_FILE
 # Pillow raises any of these for broken chunks and for sizes that would fill the memory.
 _IMAGE_ERRORS = (OSError, SyntaxError, ValueError, TypeError, IndexError, OverflowError, MemoryError, zlib.error,
                  struct.error, Image.DecompressionBombError)
@@ -30,56 +36,108 @@ _ARCHIVE_ERRORS = (OSError, ValueError, EOFError, zipfile.BadZipFile, zlib.error
                    SyntaxError, tokenize.TokenError)
 
 
+class Picture(NamedTuple):
+    """What `decode_image` made of the bytes of a PNG or JPEG, and how."""
+
+    pixels: np.ndarray
+    mode: str
+    content: bytes
+
+
+_keeping: contextvars.ContextVar[list[Picture] | None] = contextvars.ContextVar("keeping", default=None)
+
+
+@contextlib.contextmanager
+def keeping_pictures() -> Iterator[list[Picture]]:
+    """Within, the pictures that this thread reads are appended to the list that this gives, bytes and all."""
+    kept: list[Picture] = []
+    token = _keeping.set(kept)
+    try:
+        yield kept
+    finally:
+        _keeping.reset(token)
+
+
 def read_image(path: pathlib.Path, mode: str | None) -> np.ndarray:
     """Returns a PNG or JPEG in one of these ways:
 
       "RGB": uint8 [H, W, 3], "RGBA": uint8 [H, W, 4], turned as the camera says it was held (EXIF);
       "L": uint8 [H, W], of a grey image;
       "classes": [H, W], the whole number that is stored for each pixel, of a grey image or one with a palette;
-      "depth": uint16 [H, W], of a grey image of 16 bits;
+      "depth_m": float32 [H, W], of a grey image of 16 bits, centimetres; infinite where they are 65535;
       None: as it is stored.
 
     Raises:
       DataError: where the file is missing, truncated, no image, or of other pixels than the mode asks for.
     """
     try:
-        with Image.open(path) as image:
-            return _pixels(image, mode, path)
+        return decode_image(path.read_bytes(), mode, str(path))
     except FileNotFoundError as error:
         raise missing(path, "an image") from error
+    except OSError as error:
+        raise schema.DataError(f"{path}: not a readable file ({error}).") from error
+
+
+def decode_image(content: bytes, mode: str | None, where: str, shape: tuple[int, ...] | None = None) -> np.ndarray:
+    """The same of the bytes of such a file.
+
+    Args:
+      where: they come from, for messages.
+      shape: of the array, known before; PNG and JPEG of so many pixels alone are then decoded.
+
+    Raises:
+      DataError: where they are damaged, no image, or of other pixels than the mode asks for.
+    """
+    try:
+        with Image.open(io.BytesIO(content), formats=None if shape is None else PICTURE_FORMATS) as image:
+            if shape is not None and sorted((image.height, image.width)) != sorted(shape[:2]):
+                raise schema.DataError(f"{where}: a picture of {image.width}x{image.height} pixels, expected "
+                                       f"{list(shape)}")
+            pixels = _pixels(image, mode, where)
+            kept = _keeping.get()
+            if kept is not None and mode is not None and image.format in PICTURE_FORMATS:
+                pixels.flags.writeable = False  # they stay what the bytes say
+                kept.append(Picture(pixels, mode, content))
+            return pixels
     except schema.DataError:
         raise
     except _IMAGE_ERRORS as error:
-        raise schema.DataError(f"{path}: not a readable image ({error}). The file is truncated or damaged: copy it "
+        raise schema.DataError(f"{where}: not a readable image ({error}). The file is truncated or damaged: copy it "
                                f"again, or delete it so that the sequence is split there.") from error
 
 
-def _pixels(image: Image.Image, mode: str | None, path: pathlib.Path) -> np.ndarray:
+def decode_depth(pixels: np.ndarray) -> np.ndarray:
+    """Centimetres (16 bit) to float32 metres, infinite in the sky; the inverse of plain.writer.encode_depth."""
+    return np.where(pixels == DEPTH_SKY, np.float32(np.inf), pixels.astype(np.float32) * np.float32(DEPTH_UNIT_M))
+
+
+def _pixels(image: Image.Image, mode: str | None, where: str) -> np.ndarray:
     if mode is None:
         return np.asarray(image)
     is_wide = image.mode.startswith(("I", "F"))  # more than 8 bits
-    if mode == "depth":
+    if mode == "depth_m":
         pixels = np.asarray(image)
         if not image.mode.startswith("I") or (pixels.size and not 0 <= pixels.min() <= pixels.max() < 2**16):
-            raise _other_pixels(path, image, "16 bits of grey, the depth in centimetres")
-        return pixels.astype(np.uint16, copy=False)
+            raise _other_pixels(where, image, "16 bits of grey, the depth in centimetres")
+        return decode_depth(pixels)
     if mode == "classes" and image.mode in ("L", "P", "1"):
         return np.asarray(image).astype(np.uint8, copy=False)
     if is_wide:
-        raise _other_pixels(path, image, "8 bits of each colour")
+        raise _other_pixels(where, image, "8 bits of each colour")
     if mode in ("RGB", "RGBA"):
-        return np.asarray(ImageOps.exif_transpose(image).convert(mode))
+        ImageOps.exif_transpose(image, in_place=True)
+        return np.asarray(image if image.mode == mode else image.convert(mode))
     if image.mode in ("L", "1", "LA"):
         return np.asarray(image.convert("L"))
     pixels = np.asarray(image.convert("RGB"))
     if (pixels[..., 0] != pixels[..., 1]).any() or (pixels[..., 0] != pixels[..., 2]).any():
-        raise _other_pixels(path, image, "grey" if mode == "L" else "grey, the number of a class in each pixel")
+        raise _other_pixels(where, image, "grey" if mode == "L" else "grey, the number of a class in each pixel")
     return np.ascontiguousarray(pixels[..., 0])
 
 
-def _other_pixels(path: pathlib.Path, image: Image.Image, expected: str) -> schema.DataError:
-    return schema.DataError(f"{path}: an image of {image.width}x{image.height} pixels of Pillow's mode {image.mode!r}, "
-                            f"expected {expected}. Write it that way.")
+def _other_pixels(where: str, image: Image.Image, expected: str) -> schema.DataError:
+    return schema.DataError(f"{where}: an image of {image.width}x{image.height} pixels of Pillow's mode "
+                            f"{image.mode!r}, expected {expected}. Write it that way.")
 
 
 def read_npz(path: pathlib.Path, name: str) -> np.ndarray:

@@ -14,6 +14,8 @@ SHORT_RECORDING_FRAMES = 100
 # What a short recording is cut into: 0.4 s observed and 0.4 s imagined at 10 Hz.
 _SHORT = {"stride": 1, "context": 4, "horizon": 4, "frames": 8}
 _SIDE_MULTIPLE = 32
+# What a network has already that is trained: to be kept, with what the user chose, where such a one is fitted.
+OF_TRAINED = ("model.range_view.rows",)
 
 
 class Adapted(NamedTuple):
@@ -78,6 +80,24 @@ def _columns(model: config_lib.ModelConfig, lidar: config_lib.RangeViewGeometry)
     return columns
 
 
+def _rows(model: config_lib.ModelConfig, lidar: config_lib.RangeViewGeometry) -> int:
+    """The model's rows; no more than the lidar has, as near as the network's strides allow: others would stay empty."""
+    return min(model.range_view.rows, -(-lidar.rows // _SIDE_MULTIPLE) * _SIDE_MULTIPLE)
+
+
+def _fit_range_view(model: config_lib.ModelConfig, lidar: config_lib.RangeViewGeometry, keep: Collection[str],
+                    notes: list[str]) -> config_lib.RangeViewGeometry:
+    """The recorded lidar's view, with rows and columns that a model has."""
+    fitted = {name: getattr(model.range_view, name) if f"model.range_view.{name}" in keep else rule(model, lidar)
+              for name, rule in (("rows", _rows), ("columns", _columns))}
+    for name, why in (("rows", "more would be empty"), ("columns", "a pixel holds one return")):
+        usual = getattr(model.range_view, name)
+        if fitted[name] != usual:
+            notes.append(f"range views have {fitted[name]} {name} instead of {usual}: the lidar has "
+                         f"{getattr(lidar, name)}, and {why}.")
+    return dataclasses.replace(lidar, **fitted)
+
+
 def _fit_model(model: config_lib.ModelConfig, description: schema.RecordingDescription, keep: Collection[str],
                notes: list[str]) -> config_lib.ModelConfig:
     model = _without_what_lacks(model, description, notes)
@@ -89,11 +109,7 @@ def _fit_model(model: config_lib.ModelConfig, description: schema.RecordingDescr
             notes.append(f"images of {camera.width_px}x{camera.height_px} pixels become {changes['image_size'][1]}x"
                          f"{changes['image_size'][0]}: scaled by width, rows cut off at the top.")
     if lidar is not None:
-        columns = model.range_view.columns if "model.range_view.columns" in keep else _columns(model, lidar)
-        changes["range_view"] = dataclasses.replace(lidar, rows=model.range_view.rows, columns=columns)
-        if columns != model.range_view.columns:
-            notes.append(f"range views have {columns} columns instead of {model.range_view.columns}: the lidar has "
-                         f"{lidar.columns}, and a pixel holds one return.")
+        changes["range_view"] = _fit_range_view(model, lidar, keep, notes)
     if description.voxels is not None and "occupancy" in heads:
         changes["voxels"] = description.voxels
         changes["latent"] = _fit_voxel_decoder(model.latent, description.voxels, notes)

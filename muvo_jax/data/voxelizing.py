@@ -31,6 +31,7 @@ from muvo_jax.data.muvo import files as muvo_files
 from muvo_jax.data.muvo import frame_pickle, safe_pickle
 from muvo_jax.data.muvo import reader as muvo_reader
 from muvo_jax.data.muvo import runs as muvo_runs
+from muvo_jax.data.plain import cameras
 from muvo_jax.data.plain import reader as plain_reader
 from muvo_jax.ops import camera as camera_ops
 from muvo_jax.ops import voxels as voxel_ops
@@ -44,11 +45,12 @@ _LEVEL = ((0, 0, 1), (-1, 0, 0), (0, -1, 0))
 
 
 class Frame(NamedTuple):
-    """The files of one frame: two to read, one to write."""
+    """The files of one frame, two to read, one to write; and its intrinsics and camera_to_ego, if not the Rig's."""
 
     depth: pathlib.Path
     points: pathlib.Path
     target: pathlib.Path
+    calibration: schema.RawFrame | None = None
 
 
 class Rig(NamedTuple):
@@ -86,7 +88,7 @@ def voxelize(path: pathlib.Path | str, *, rule: str = "carved", overwrite: bool 
       BlockingIOError: where another process works on `path`.
       RuntimeError: where a worker was killed.
     """
-    path = pathlib.Path(path)
+    path = pathlib.Path(path).expanduser()
     if rule not in RULES or (workers is not None and workers < 1):
         raise ValueError(f"rule {rule!r}, {workers} workers: expected one of {', '.join(RULES)}, at least one worker.")
     rig, runs = _survey(path, rule)
@@ -211,9 +213,10 @@ def _survey_plain(path: pathlib.Path, rule: str) -> tuple[Rig, dict[pathlib.Path
                            for name in ("camera", "lidar", "voxels"))
     runs = {}
     for run in plain_reader.read_runs(path, tuple(description.field(header, "splits", list, toml_path))):
-        names = [f"{int(number):06d}" for number in run.columns["frame_id"]]
-        runs[run.folder] = [Frame(run.folder / "depth" / f"{name}.png", run.folder / "lidar" / f"{name}.npz",
-                                  run.folder / "occupancy" / f"{name}.npz") for name in names]
+        cameras.check(run.columns, camera, run.folder / plain_reader.FRAMES_FILE)
+        depths, scans, targets = (plain_reader.frame_files(run, name) for name in ("depth_m", "points_m", "occupancy"))
+        runs[run.folder] = [Frame(depths[row], scans[row], targets[row], cameras.of_frame(run.columns, row, camera))
+                            for row in range(len(depths))]
     return Rig(False, rule, camera, lidar.position_m, grid), runs
 
 
@@ -259,7 +262,8 @@ def _content(rig: Rig, frame: Frame) -> bytes:
         keep: Callable[[np.ndarray], np.ndarray] = _without_own_car
         depth_m, points_m = np.where(depth < 1.0, depth * muvo_files.DEPTH_RANGE_M, np.inf), scan.points_m
     else:
-        depth_m = plain_reader.decode_depth(files.read_image(frame.depth, None))
+        depth_m = (files.read_npz(frame.depth, "depth_m") if frame.depth.suffix.lower() == ".npz" else
+                   files.read_image(frame.depth, "depth_m"))
         points_m = files.read_npz(frame.points, "points_m").astype(np.float32)
         if depth_m.ndim != 2 or points_m.shape[1:] != (3,):
             raise schema.DataError(f"{frame.depth}, {frame.points}: depth of shape {list(depth_m.shape)}, points of "
@@ -267,6 +271,8 @@ def _content(rig: Rig, frame: Frame) -> bytes:
         points_m = files.finite_points(points_m, frame.points)
         keep = _all
     intrinsics, camera_to_ego = _pinhole(rig.camera, depth_m.shape, frame.depth)
+    if frame.calibration is not None:
+        intrinsics, camera_to_ego = frame.calibration["intrinsics"], frame.calibration["camera_to_ego"]
     if rig.rule == "reference":
         seen_m = camera_ops.depth_to_points(depth_m, intrinsics, camera_to_ego)
         occupancy = voxel_ops.voxelize(np.concatenate([seen_m, points_m]), rig.grid)

@@ -154,7 +154,8 @@ def _prepare_early(config: config_lib.Config,
 def _open_data(job: Job, show: screen.Screen) -> tuple[config_lib.Config, schema.Recording, float]:
     start_s = time.perf_counter()
     recording = job.open_recording()
-    adapted = fitting.adapt(job.config, recording, keep=job.chosen)
+    trained = fitting.OF_TRAINED if job.resume or job.init else ()
+    adapted = fitting.adapt(job.config, recording, keep=(*job.chosen, *trained))
     fitting.check_targets(adapted.config, recording.description)
     description = recording.description
     counts = provenance(recording, adapted.config)["frames"]

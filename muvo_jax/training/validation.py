@@ -84,8 +84,9 @@ def windows_of_run(run: run_lib.Run | str | os.PathLike, split: str | None = Non
     recording = recordings.open_configured(config, split=split or recordings.HELD_OUT)
     held_out = [name for name in recording.description.splits if name != "train"]
     split = split or (held_out or ["train"])[0]
-    entry = next(pipeline.evaluation_batches(pipeline.Frames(recording, fitting.adapt(config, recording).config), split,
-                                             windows=count, length=frames, batch=count))
+    fitted = fitting.adapt(config, recording, keep=fitting.OF_TRAINED).config
+    entry = next(pipeline.evaluation_batches(pipeline.Frames(recording, fitted), split, windows=count, length=frames,
+                                             batch=count))
     if entry.count < count:
         raise schema.DataError(f"split {split!r} of {recording.description.name!r} has {entry.count} windows of "
                                f"{entry.batch.frames} frames, {count} were asked for. Ask for fewer or shorter ones.")

@@ -25,6 +25,7 @@ GRID = config_lib.VoxelGrid((4, 5, 3), 1.0, (-2.0, -2.5, -1.0))
 LIDAR = config_lib.RangeViewGeometry(rows=4, columns=8)
 CAMERA = schema.Camera(9, 6, ((5.1, 0.0, 4.5), (0.0, 5.1, 3.0), (0.0, 0.0, 1.0)),
                        ((0.0, 0.0, 1.0, 1.5), (-1.0, 0.0, 0.0, 0.1), (0.0, -1.0, 0.0, 1.6), (0.0, 0.0, 0.0, 1.0)))
+# The others are drawn as they must be, or made of one of these.
 WRITTEN = [field for field in fields.TABLE if field.name not in ("intrinsics", "camera_to_ego", "image_instance_mask",
                                                                   "frame_id", "timestamp_s")]
 
@@ -47,6 +48,22 @@ def numbers_of(field):
 
 
 @st.composite
+def cameras(draw):
+    """A camera that looks anywhere from anywhere on a car, or none: then the description's is meant."""
+    if draw(st.booleans()):
+        return {}
+    cosine, sine = np.cos(angle := draw(st.floats(-3.2, 3.2))), np.sin(angle)
+    pose = np.eye(4, dtype=np.float32)
+    pose[:2, :2] = [[cosine, -sine], [sine, cosine]]
+    pose[:3, :3] = pose[:3, :3] @ np.float32(CAMERA.camera_to_ego)[:3, :3]
+    pose[:3, 3] = draw(arrays.arrays(np.float32, 3, elements=st.floats(-30, 30, width=32)))
+    intrinsics = np.eye(3, dtype=np.float32)
+    intrinsics[0] = draw(st.tuples(*(st.floats(*ends, width=32) for ends in ((1, 90), (-5, 5), (-9, 18)))))
+    intrinsics[1, 1:] = draw(st.tuples(*(st.floats(*ends, width=32) for ends in ((1, 90), (-6, 12)))))
+    return {"intrinsics": intrinsics, "camera_to_ego": pose}
+
+
+@st.composite
 def frames(draw):
     """One frame of all fields that a writer takes, as a reader would give it."""
     frame = {"frame_id": np.int64(draw(st.integers(0, 2**63 - 1))),
@@ -55,6 +72,7 @@ def frames(draw):
         shape = tuple(SIZES.get(size, size) for size in field.shape)
         values = draw(arrays.arrays(field.dtype, shape, elements=numbers_of(field)))
         frame[field.name] = values if shape else field.dtype(values[()])
+    frame |= draw(cameras())
     if draw(st.booleans()):
         frame["depth_m"] = plain_reader.decode_depth(plain_writer.encode_depth(frame["depth_m"]))
         frame["depth_m"][0, 0] = np.inf
@@ -90,9 +108,13 @@ def test_raw_frames_and_batches_follow_the_table():
         if field is not None:
             assert dtype == field.dtype, name
             assert rank == len(field.shape) + (1 if name in types.UNTIMED_FIELDS else 2), name
-    for field in fields.TABLE:  # each lies in one place: a folder, columns, or the description
-        assert bool(field.folder) + bool(field.columns) == (field.name not in ("intrinsics", "camera_to_ego"))
+    for field in fields.TABLE:  # each lies in one place: a folder or columns
+        assert bool(field.folder) + bool(field.columns) == 1
         assert bool(field.array) == (".npz" in field.suffixes)
+    value = np.arange(16.0, dtype=np.float32).reshape(4, 4)
+    value[3] = 0, 0, 0, 1
+    field = fields.FIELDS["camera_to_ego"]
+    np.testing.assert_array_equal(field.of_cells(field.to_cells(value)), value)
 
 
 @settings(max_examples=25, deadline=None)
@@ -105,6 +127,55 @@ def test_every_field_is_written_and_read_bit_for_bit(tmp_path_factory, frame):
     second = copy(root / "twice", [read])
     assert_same(second.read(second.sequences[0], 0), read)
     assert_same(records.decode_frame(records.encode_frame(read, records.Encoding()), "memory"), read)
+
+
+def described_frame(number, **camera):
+    return {"frame_id": number, "timestamp_s": number / 10, "speed_mps": 1.0, "acceleration": 0.0, "steering": 0.0,
+            "image": np.full((6, 9, 3), number, np.uint8)} | camera
+
+
+def moved(x_m):
+    pose = np.array(CAMERA.camera_to_ego, np.float32)
+    pose[0, 3] = x_m
+    return pose
+
+
+def test_the_camera_of_a_frame_stands_in_its_row_where_it_is_not_the_described_one(tmp_path):
+    usual = np.array(CAMERA.camera_to_ego, np.float32)
+    still = copy(tmp_path / "still", [described_frame(number, camera_to_ego=usual) for number in range(2)])
+    assert "camera_to_ego_11" not in (tmp_path / "still/train/a/frames.csv").read_text()
+    moving = copy(tmp_path / "moving", [described_frame(0), described_frame(1, camera_to_ego=moved(2.5)),
+                                        described_frame(2, intrinsics=[[2.0, 0, 4], [0, 2, 3], [0, 0, 1]])])
+    poses = [[recording.read(recording.sequences[0], index)["camera_to_ego"] for index in range(2)]
+             for recording in (still, moving)]
+    np.testing.assert_array_equal(poses, [[usual, usual], [usual, moved(2.5)]])
+    np.testing.assert_array_equal(moving.read(moving.sequences[0], 2)["intrinsics"], [[2, 0, 4], [0, 2, 3], [0, 0, 1]])
+    header = (tmp_path / "moving/train/a/frames.csv").read_text().splitlines()[0]
+    assert header.endswith(",intrinsics_22,intrinsics_23,camera_to_ego_11,camera_to_ego_12,camera_to_ego_13,"
+                           "camera_to_ego_14,camera_to_ego_21,camera_to_ego_22,camera_to_ego_23,camera_to_ego_24,"
+                           "camera_to_ego_31,camera_to_ego_32,camera_to_ego_33,camera_to_ego_34")
+
+
+@pytest.mark.parametrize(("old", "new", "message"), [
+    ("camera_to_ego_23", "other", "frames.csv: column camera_to_ego_23 is missing; it belongs to camera_to_ego_11"),
+    (",2.5,", ",2500,", r"frames.csv, line 3: Camera.camera_to_ego puts the camera at \[2500"),
+    (",2.5,", ",,", "frames.csv, line 3: camera_to_ego_14 is '', expected a finite number"),
+    (",1.0,2.5,", ",2.0,2.5,", "frames.csv, line 3: Camera.camera_to_ego is .*must be a rotation"),
+])
+def test_a_camera_of_a_frame_that_cannot_be_is_refused_by_line(tmp_path, old, new, message):
+    copy(tmp_path, [described_frame(0), described_frame(1, camera_to_ego=moved(2.5))])
+    table = tmp_path / "train/a/frames.csv"
+    assert old in table.read_text()
+    table.write_text(table.read_text().replace(old, new))
+    with pytest.raises(schema.DataError, match=message):
+        plain_reader.PlainRecording(tmp_path)
+
+
+def test_a_camera_without_its_last_row_and_a_target_by_its_column_are_written_or_refused(tmp_path):
+    with pytest.raises(schema.DataError, match=r"frame 0: the last row of camera_to_ego is \[0.0, 0.0, 1.0, 0.0\]"):
+        copy(tmp_path / "wrong", [described_frame(0, camera_to_ego=np.eye(4)[[0, 1, 3, 2]])])
+    written = copy(tmp_path / "right", [described_frame(0, target_x_m=3.0, target_y_m=-4.0)])
+    np.testing.assert_array_equal(written.read(written.sequences[0], 0)["target_m"], [3.0, -4.0])
 
 
 def test_a_run_may_have_one_of_the_masks_that_share_a_file(tmp_path):

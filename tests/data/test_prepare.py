@@ -48,6 +48,19 @@ def test_kitti_gives_the_town_preset_its_sensors(kitti_recording):
     assert any("no occupancy is recorded" in note for note in notes)
 
 
+@pytest.mark.parametrize(("rows", "fitted"), [(16, 32), (32, 32), (33, 64), (40, 64), (64, 64), (128, 64)])
+def test_range_views_have_no_rows_that_no_beam_fills(kitti_recording, rows, fitted):
+    lidar = dataclasses.replace(kitti_recording.description.lidar, rows=rows)
+    other = with_description(kitti_recording, lidar=lidar)
+    config, notes = fitting.adapt(presets.get("town"), other)
+    assert config.model.range_view.rows == fitted  # the preset has 64, and networks take multiples of 32
+    said = f"range views have {fitted} rows instead of 64: the lidar has {rows}, and more would be empty."
+    assert (said in notes) == (fitted < 64)
+    assert fitting.adapt(config, other).config == config
+    for keep in ({"model.range_view.rows"}, fitting.OF_TRAINED):
+        assert fitting.adapt(presets.get("town"), other, keep=keep).config.model.range_view.rows == 64
+
+
 def test_a_short_recording_gets_short_windows(kitti_recording):
     config, notes = fitting.adapt(presets.get("town"), kitti_recording)  # 16 frames train, 8 validate
     data = config.data

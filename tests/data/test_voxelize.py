@@ -9,7 +9,7 @@ import recording_writers as writers
 from PIL import Image
 
 from muvo_jax import voxelize as command
-from muvo_jax.data import schema, voxelizing
+from muvo_jax.data import fields, schema, voxelizing
 from muvo_jax.data.muvo import reader as muvo_reader
 from muvo_jax.data.muvo import runs as muvo_runs
 from muvo_jax.data.muvo import safe_pickle
@@ -55,6 +55,24 @@ def test_rays_carve_what_they_pass_and_the_rest_is_unknown(recording):
     np.testing.assert_array_equal(grid, expected)
     read = plain_reader.PlainRecording(recording)
     np.testing.assert_array_equal(read.read(read.sequences[-1], 1)["occupancy"], expected)
+
+
+def test_each_frame_has_the_camera_of_its_row_and_files_any_name_that_the_reader_takes(recording):
+    run = recording / "train/a"
+    header, first, second = (run / "frames.csv").read_text().split()
+    lines = [f"{header},{','.join(fields.FIELDS['camera_to_ego'].columns)}"]
+    for line, y_m in ((first, 0.5), (second, -2.5)):
+        lines.append(f"{line},0,0,1,-7.5,-1,0,0,{y_m},0,-1,0,0.5")
+    (run / "frames.csv").write_text("\n".join(lines) + "\n")
+    (run / "lidar/000001.npz").rename(run / "lidar/1.NPZ")
+    np.savez(run / "depth/01.npz", depth_m=np.pad(np.float32([[4.0]]), 1))
+    (run / "depth/000001.png").unlink()
+    (run / "occupancy").mkdir()
+    (run / "occupancy/rule.json").write_text("{}")  # what an interruption at the first frame leaves
+    plain_reader.PlainRecording(recording)
+    voxelizing.voxelize(recording, workers=1, overwrite=True)
+    assert [np.argwhere(occupancy(recording, frame=frame) == 1).tolist() for frame in range(2)] == [
+        [[4, 13, 2], [5, 8, 2]], [[4, 5, 2], [4, 13, 2]]]
 
 
 def test_sky_carves_to_the_border(recording):

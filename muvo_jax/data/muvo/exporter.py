@@ -147,7 +147,11 @@ def _write_run(recording: plain_reader.PlainRecording, sequence: schema.Sequence
 def _write_frame(frame: schema.RawFrame, recording: plain_reader.PlainRecording, target: pathlib.Path,
                  number: int) -> None:
     described = recording.description
-    assert described.lidar is not None
+    assert described.lidar is not None and described.camera is not None
+    for name in ("intrinsics", "camera_to_ego"):
+        if not np.array_equal(frame[name], np.asarray(getattr(described.camera, name), np.float32)):  # type: ignore
+            raise schema.DataError(f"frame {int(frame['frame_id'])} has {name} of its own in frames.csv, but the "
+                                   f"layout knows one camera for all. Export frames of one camera.")
     tags_of = _layout_tags(recording)
 
     def path(kind: str) -> pathlib.Path:

@@ -13,7 +13,8 @@ from muvo_jax import config as config_lib
 from muvo_jax.data import description as description_lib
 from muvo_jax.data import fields, files, schema
 
-SCHEMA_VERSION = 1
+SCHEMA_VERSION = 2  # 1 had no recorded bytes of pictures in its records
+_READABLE_VERSIONS = (1, SCHEMA_VERSION)
 MANIFEST_FILE = "manifest.json"
 FRAMES_PER_SHARD = 256  # where nothing else is said
 # What values that are anything at all can lead to.
@@ -34,9 +35,9 @@ def read_manifest(root: pathlib.Path) -> dict:
     except (ValueError, RecursionError) as error:
         raise schema.DataError(f"{path}: not valid JSON ({error}). Pack the recording again.") from error
     version = manifest.get("schema_version") if isinstance(manifest, dict) else None
-    if version != SCHEMA_VERSION:
-        raise schema.DataError(f"{path}: schema_version is {version!r}, this reader knows {SCHEMA_VERSION}. Pack the "
-                               f"recording again, or use the muvo_jax that wrote it.")
+    if type(version) is not int or version not in _READABLE_VERSIONS:
+        raise schema.DataError(f"{path}: schema_version is {version!r}, this reader knows {SCHEMA_VERSION} and earlier "
+                               f"ones. Pack the recording again, or use the muvo_jax that wrote it.")
     lacking = [name for name in ("shards", "frames_per_shard", "sequences", "description") if name not in manifest]
     if lacking:
         raise schema.DataError(f"{path}: {', '.join(lacking)} missing. Pack the recording again.")

@@ -12,17 +12,18 @@ import json
 import math
 import struct
 import zlib
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from typing import Any
 
 import numpy as np
 from PIL import Image
 
-from muvo_jax.data import schema
+from muvo_jax.data import files, schema
 from muvo_jax.data.packed import manifest
 
 _LENGTH = struct.Struct("<I")
 _ENCODINGS = ("raw", "zlib", "png", "jpeg", "float16")
+_RECORDED = {f"recorded {mode}": mode for mode in files.PICTURE_MODES}  # the bytes of a file, and how they are read
 _LARGEST_ARRAY_BYTES = 1 << 30  # what a field of a frame may claim before memory is taken for it
 # What headers, arrays and pictures that are anything at all can lead to.
 _MALFORMED = (ValueError, KeyError, TypeError, AttributeError, OSError, OverflowError, RecursionError, MemoryError,
@@ -46,14 +47,19 @@ class Encoding:
             raise ValueError(f"jpeg_quality is {self.jpeg_quality}, expected 1 to 95, or None for PNG.")
 
 
-def encode_frame(frame: schema.RawFrame, encoding: Encoding) -> bytes:
-    """One frame as one record."""
+def encode_frame(frame: schema.RawFrame, encoding: Encoding, recorded: Sequence[files.Picture] = ()) -> bytes:
+    """One frame as one record.
+
+    Args:
+      recorded: pictures that were read for it: a field that is the pixels of one of them is kept as its bytes.
+    """
+    contents = {id(picture.pixels): picture for picture in recorded}
     header, parts = [], []
     for name, value in frame.items():
         array = np.asarray(value)
         if array.dtype.hasobject:
             raise ValueError(f"{name}: arrays of objects are not stored.")
-        kind, content = _encode(name, array, encoding)
+        kind, content = _encode(name, array, encoding, contents.get(id(array)))
         header.append({"name": name, "dtype": array.dtype.str, "shape": list(array.shape), "encoding": kind,
                        "bytes": len(content)})
         parts.append(content)
@@ -97,12 +103,15 @@ def damaged(where: str, why: str) -> schema.DataError:
                             f"with data.skip_corrupt_shards (records.PackedRecording(corrupt=\"skip\")).")
 
 
-def _encode(name: str, array: np.ndarray, encoding: Encoding) -> tuple[str, bytes]:
+def _encode(name: str, array: np.ndarray, encoding: Encoding, recorded: files.Picture | None) -> tuple[str, bytes]:
+    as_jpeg = name == "image" and encoding.jpeg_quality is not None
+    if recorded is not None and not as_jpeg:
+        return f"recorded {recorded.mode}", recorded.content
     if name == "points_m" and encoding.half_points:
         return "float16", zlib.compress(np.ascontiguousarray(array, np.float16).tobytes(), 1)
     if array.dtype == np.uint8 and (array.ndim == 2 or (array.ndim == 3 and array.shape[2] == 3)):
         content = io.BytesIO()
-        if name == "image" and encoding.jpeg_quality is not None:
+        if as_jpeg:
             Image.fromarray(array).save(content, "JPEG", quality=encoding.jpeg_quality, subsampling=0)
             return "jpeg", content.getvalue()
         Image.fromarray(array).save(content, "PNG", compress_level=1)
@@ -112,16 +121,13 @@ def _encode(name: str, array: np.ndarray, encoding: Encoding) -> tuple[str, byte
 
 
 def _decode(content: bytes, encoding: str, dtype: np.dtype, shape: tuple[int, ...]) -> np.ndarray:
-    if dtype.hasobject or encoding not in _ENCODINGS:
+    if dtype.hasobject or encoding not in (*_ENCODINGS, *_RECORDED):
         raise ValueError(f"encoding {encoding!r} of {dtype} is unknown")
     size = math.prod(shape)
     if not all(manifest.is_count(side) for side in shape) or size * dtype.itemsize > _LARGEST_ARRAY_BYTES:
         raise ValueError(f"{dtype}{list(shape)} is larger than {_LARGEST_ARRAY_BYTES} bytes")
-    if encoding in ("png", "jpeg"):
-        with Image.open(io.BytesIO(content)) as image:
-            if (image.height, image.width) != shape[:2]:
-                raise ValueError(f"a picture of {image.width}x{image.height} pixels, expected {list(shape)}")
-            array = np.asarray(image)
+    if encoding in ("png", "jpeg") or encoding in _RECORDED:
+        array = files.decode_image(content, _RECORDED.get(encoding), "its picture", shape)
     elif encoding == "float16":
         array = np.frombuffer(_inflated(content, 2 * size), np.float16).astype(dtype).reshape(shape)
     elif encoding == "zlib":

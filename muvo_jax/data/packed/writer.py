@@ -99,7 +99,9 @@ def write_shard(recording: schema.Recording, out: pathlib.Path, encoding: record
     try:
         for sequence, start, stop in shard.parts:
             for index in range(start, stop):
-                writer.write(records.encode_frame(recording.read(sequence, index), encoding))
+                with files.keeping_pictures() as pictures:
+                    frame = recording.read(sequence, index)
+                writer.write(records.encode_frame(frame, encoding, pictures))
                 yield shard.number
     finally:
         writer.close()

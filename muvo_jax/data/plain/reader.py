@@ -1,7 +1,8 @@
 """The plain recording format: PNG, NPZ, CSV and TOML in folders that any tool can read (no pickle).
 
     ROOT/recording.toml                         what holds for all of it: sensors, voxel grid, action contract
-    ROOT/<split>/<run>/frames.csv               one line a frame, written last: a run without it is incomplete
+    ROOT/<split>/<run>/frames.csv               one line a frame, written last: a run without it is incomplete; with the
+                                                camera's place in the line where that is another one than the described
     ROOT/<split>/<run>/image/000012.png         RGB, 8 bit (or .jpg, .jpeg)
     ROOT/<split>/<run>/lidar/000012.npz         points_m float32 [N, 3], ego frame
     ROOT/<split>/<run>/occupancy/000012.npz     occupancy uint8 [X, Y, Z]
@@ -33,18 +34,17 @@ import numpy as np
 
 from muvo_jax import config as config_lib
 from muvo_jax.data import description, fields, files, runs, schema, sequences
-from muvo_jax.data.plain import frames_table
+from muvo_jax.data.plain import cameras, frames_table
 
 SCHEMA_VERSION = 1
 DESCRIPTION_FILE = "recording.toml"
 FRAMES_FILE = frames_table.FRAMES_FILE
-DEPTH_UNIT_M = 0.01
-DEPTH_SKY = 65535
+DEPTH_UNIT_M, DEPTH_SKY, decode_depth = files.DEPTH_UNIT_M, files.DEPTH_SKY, files.decode_depth
 _DIGITS = 6
 _NEEDED = frozenset(("speed_mps", "action", "timestamp_s", "frame_id"))
 _TOP_LEVEL = ("schema_version", "name", "rate_hz", "splits", "classes")
-_MODES = {"image": "RGB", "route_map": "L", "image_classes": "classes", "depth_m": "depth"}
-_OF_IMAGE = ("intrinsics", "camera_to_ego")
+_MODES = {"image": "RGB", "route_map": "L", "image_classes": "classes", "depth_m": "depth_m"}
+_OF_IMAGE = frozenset(field.name for field in cameras.FIELDS)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -113,22 +113,24 @@ class PlainRecording:
             name=str(description.field(header, "name", str, toml_path)), kind="plain", rate_hz=rate_hz,
             camera=section("camera", "image" in modalities), lidar=section("lidar", "points_m" in modalities),
             voxels=voxels, contract=contract, splits=splits,
-            modalities=modalities | (set(_OF_IMAGE) if "image" in modalities else set()),
+            modalities=modalities | (_OF_IMAGE if "image" in modalities else frozenset()),
             classes=self._class_names if labels & {"image_classes", "point_classes"} else (),
             route_map=(section("route_map", False) or config_lib.RouteMap()) if "route_map" in modalities else None)
+        if self.description.camera is not None:
+            for run in every:
+                cameras.check(run.columns, self.description.camera, run.folder / FRAMES_FILE)
 
     def read(self, sequence: schema.Sequence, index: int) -> schema.RawFrame:
         """See schema.Recording."""
         run, position = self._runs[sequence.name], sequence.start + index
         frame: dict[str, Any] = {name: self._of_table(run, name, position) for name in fields.FIELDS
-                                 if self._has(sequence, name) and fields.FIELDS[name].columns}
+                                 if self._has(sequence, name) and fields.FIELDS[name].columns and name not in _OF_IMAGE}
         for name in fields.FIELDS:
             if self._has(sequence, name) and fields.FIELDS[name].folder:
                 frame |= self._of_file(run, name, position, frame)
         camera = self.description.camera
         if "image" in frame and camera is not None:
-            frame["intrinsics"] = np.asarray(camera.intrinsics, np.float32)
-            frame["camera_to_ego"] = np.asarray(camera.camera_to_ego, np.float32)
+            frame |= cameras.of_frame(run.columns, position, camera)
         return frame  # type: ignore[return-value]
 
     def action(self, sequence: schema.Sequence, index: int) -> np.ndarray:
@@ -153,8 +155,7 @@ class PlainRecording:
         field = fields.FIELDS[name]
         if name == "is_terminal" and name not in run.columns:
             return np.bool_(False)
-        values = [run.columns[column][position] for column in field.columns]
-        return np.array(values, field.dtype) if field.shape else field.dtype(values[0])
+        return field.of_cells([run.columns[column][position] for column in field.columns])
 
     def _of_file(self, run: Run, name: str, position: int, frame: dict[str, Any]) -> dict[str, Any]:
         """The field of a frame, and what comes with it."""
@@ -173,7 +174,6 @@ class PlainRecording:
             values = files.read_npz(path, field.array)
         else:
             values = files.read_image(path, _MODES[name])
-            values = decode_depth(values) if name == "depth_m" else values
         camera, grid = described.camera, described.voxels
         sizes: dict[str, int | None] = dict.fromkeys("HWNXYZ")
         if camera is not None:
@@ -188,13 +188,13 @@ class PlainRecording:
 
     def _path(self, run: Run, name: str, frame_id: int) -> pathlib.Path:
         field = fields.FIELDS[name]
-        usual = f"{frame_id:0{_DIGITS}d}{field.suffixes[0]}"
-        return run.folder / field.folder / self._files[run.name][field.folder].unusual.get(frame_id, usual)
+        return _file(run, field, frame_id, self._files[run.name][field.folder].unusual)
 
     def _fields_of(self, run: Run) -> frozenset[str]:
         """The fields that a run has, in its table and in its folders."""
         found = {name for name, field in fields.FIELDS.items()
                  if field.columns and all(column in run.columns for column in field.columns)}
+        found -= _OF_IMAGE  # a run without such columns has the description's
         if self._has_terminals:  # a run without the column never ends in one
             found.add("is_terminal")
         here = self._files[run.name]
@@ -233,11 +233,6 @@ class PlainRecording:
         return [schema.Sequence(run.split, run.name, start, length, lacks) for start, length in pieces]
 
 
-def decode_depth(pixels: np.ndarray) -> np.ndarray:
-    """Centimetres (16 bit) to float32 metres, infinite in the sky; the inverse of writer.encode_depth."""
-    return np.where(pixels == DEPTH_SKY, np.float32(np.inf), pixels.astype(np.float32) * np.float32(DEPTH_UNIT_M))
-
-
 def read_header(root: pathlib.Path) -> dict:
     """Returns recording.toml; raises DataError where it is missing, malformed or of another version."""
     path = root / DESCRIPTION_FILE
@@ -272,6 +267,17 @@ def _runs_of(root: pathlib.Path, split: str) -> list[Run]:
     read = [Run(split, folder, frames_table.read(folder / FRAMES_FILE)) for folder in folders
             if (folder / FRAMES_FILE).is_file()]
     return [run for run in read if len(run.columns["frame_id"])]
+
+
+def frame_files(run: Run, name: str) -> list[pathlib.Path]:
+    """The file of a field in each frame of a run, as it is named there or, where it is missing, as a writer would."""
+    field = fields.FIELDS[name]
+    unusual = _files_of(run, [field])[field.folder].unusual
+    return [_file(run, field, frame_id, unusual) for frame_id in run.columns["frame_id"].tolist()]
+
+
+def _file(run: Run, field: fields.Field, frame_id: int, unusual: dict[int, str]) -> pathlib.Path:
+    return run.folder / field.folder / unusual.get(frame_id, f"{frame_id:0{_DIGITS}d}{field.suffixes[0]}")
 
 
 def _files_of(run: Run, wanted: list[fields.Field]) -> dict[str, _Files]:

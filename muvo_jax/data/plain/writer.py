@@ -18,7 +18,7 @@ from PIL import Image
 
 from muvo_jax import config as config_lib
 from muvo_jax.data import description, fields, files, schema
-from muvo_jax.data.plain import frames_table
+from muvo_jax.data.plain import cameras, frames_table
 from muvo_jax.data.plain import reader as plain_reader
 
 COLUMNS = ("frame_id", "timestamp_s", "x_m", "y_m", "yaw_rad", "speed_mps", "acceleration", "steering", "reward",
@@ -27,8 +27,7 @@ DEPTH_UNIT_M, DEPTH_SKY = plain_reader.DEPTH_UNIT_M, plain_reader.DEPTH_SKY
 _NO_FILE = fields.Field("", np.uint8)
 # Names of RawFrame and what recorders call them: both are taken.
 _ALIASES = {"classes": "image_classes", "point_tags": "point_classes"}
-# Of RawFrame, but kept in the description, or made of another field.
-_NOT_WRITTEN = ("intrinsics", "camera_to_ego", "image_instance_mask")
+_NOT_WRITTEN = ("image_instance_mask",)  # made of image_classes
 KEYS = frozenset((*COLUMNS, *fields.COLUMNS, *fields.FIELDS, *_ALIASES))
 
 
@@ -75,7 +74,8 @@ class RunWriter:
 
     def __init__(self, root: pathlib.Path | str, split: str, run: str):
         """Raises FileExistsError where the run is complete already."""
-        self.folder = pathlib.Path(root).expanduser() / split / run
+        self._root = pathlib.Path(root).expanduser()
+        self.folder = self._root / split / run
         if is_complete(root, split, run):
             raise FileExistsError(f"{self.folder} is recorded already; remove it to record it again.")
         shutil.rmtree(self.folder, ignore_errors=True)
@@ -121,13 +121,29 @@ class RunWriter:
         self._rows.append(row)
 
     def close(self) -> None:
-        """Completes the run."""
+        """Completes the run. The camera of the frames is left out where it is the description's in every frame."""
         table = io.StringIO(newline="")
+        self._settle_cameras()
         more = [name for name in fields.COLUMNS if name not in COLUMNS and any(name in row for row in self._rows)]
         writer = csv.DictWriter(table, (*COLUMNS, *more), restval="", lineterminator="\n")
         writer.writeheader()
         writer.writerows(self._rows)
         files.write_atomically(self.folder / plain_reader.FRAMES_FILE, table.getvalue())
+
+    def _settle_cameras(self) -> None:
+        try:
+            header = plain_reader.read_header(self._root)
+            camera = description.section(header, "camera", self._root, required=False)
+        except schema.DataError:  # not described yet
+            camera = None
+        for field in cameras.FIELDS if camera is not None else ():
+            usual = _cells_of(field, np.asarray(getattr(camera, field.name), field.dtype))
+            every = [usual | {column: row[column] for column in usual if column in row} for row in self._rows]
+            is_usual = all(cells == usual for cells in every)
+            for row, cells in zip(self._rows, every, strict=True):
+                row |= cells
+                for column in cells if is_usual else ():
+                    del row[column]
 
     def _path(self, folder: str, frame_id: int, suffix: str) -> pathlib.Path:
         path = self.folder / folder / f"{frame_id:06d}{suffix}"
@@ -152,15 +168,22 @@ def _row(frame: Mapping, where: str) -> dict[str, str]:
     Raises:
       DataError: for a number that its field cannot have.
     """
-    row = {name: _cell(frame[name]) for name in COLUMNS if name in frame}
+    row = {name: _cell(frame[name]) for name in (*COLUMNS, *fields.COLUMNS) if name in frame}
     for name, field in fields.FIELDS.items():
         if name in frame and field.columns:
-            values = np.atleast_1d(fields.conform(name, frame[name], where))
-            row = {column: _cell(value) for column, value in zip(field.columns, values, strict=True)} | row
+            value = fields.conform(name, frame[name], where)
+            if field in cameras.FIELDS and (value[-1] != np.eye(len(value))[-1]).any():
+                raise schema.DataError(f"{where}: the last row of {name} is {value[-1].tolist()}, expected 0, ..., 0, "
+                                       f"1.")
+            row = _cells_of(field, value) | row
     for column, field in fields.COLUMNS.items():
         if column in frame and field.shape:
             frames_table.number(row[column], field, f"{where}: {column}")
     return row
+
+
+def _cells_of(field: fields.Field, value: np.ndarray) -> dict[str, str]:
+    return {column: _cell(cell) for column, cell in zip(field.columns, field.to_cells(value), strict=True)}
 
 
 def encode_depth(depth_m: np.ndarray) -> np.ndarray:

@@ -1,12 +1,14 @@
 """Plain recordings in the authors' layout: read back by our reader, and built like the authors' own files."""
 
+import shutil
+
 import numpy as np
 import pytest
 import recording_samples as samples
 import recording_writers as writers
 
 from muvo_jax import config as config_lib
-from muvo_jax.data import schema, sources
+from muvo_jax.data import fields, schema, sources
 from muvo_jax.data.muvo import exporter as muvo_exporter
 from muvo_jax.data.muvo import files as muvo_files
 from muvo_jax.data.muvo import reader as muvo_reader
@@ -51,6 +53,18 @@ def exported(source, tmp_path_factory):
     out = tmp_path_factory.mktemp("out") / "als muvo"
     assert muvo_exporter.export(source, out) == 2 * FRAMES
     return out
+
+
+def test_a_camera_of_each_frame_does_not_fit_into_the_layout(source, tmp_path):
+    moved = shutil.copytree(source, tmp_path / "source")
+    table = moved / "train/a/frames.csv"
+    pose = plain_reader.PlainRecording(source).description.camera.camera_to_ego
+    camera = ",".join(str(value) for row in (*pose[:2], (*pose[2][:3], 2.5)) for value in row)
+    header, *rows = table.read_text().splitlines()
+    columns = ",".join(fields.FIELDS["camera_to_ego"].columns)
+    table.write_text("\n".join([f"{header},{columns}", *(f"{row},{camera}" for row in rows)]) + "\n")
+    with pytest.raises(schema.DataError, match="frame 0 has camera_to_ego of its own"):
+        muvo_exporter.export(moved, tmp_path / "out")
 
 
 def test_what_is_read_back_is_what_was_recorded(source, exported):

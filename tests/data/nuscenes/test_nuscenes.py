@@ -16,6 +16,7 @@ from muvo_jax.data import fitting, prepare, schema, sequences, sources
 from muvo_jax.data.nuscenes import reader, scans, scene_splits, tables
 from muvo_jax.data.packed import reader as packed_reader
 from muvo_jax.data.packed import writer as packed_writer
+from muvo_jax.data.plain import writer as plain_writer
 from muvo_jax.ops import camera as camera_ops
 from muvo_jax.training import screen
 
@@ -398,6 +399,29 @@ def test_packs_hold_the_same_frames_and_follow_what_is_corrected(root, tmp_path)
     assert len(packed_reader.PackedRecording(out).read(source.sequences[1], 0)["points_m"]) == 1
 
 
+def test_a_plain_copy_has_the_camera_of_each_frame_and_scene(root, tmp_path):
+    source = opened(root, key_frames=True)
+    described = source.description
+    plain_writer.write_description(tmp_path / "copy", name="copy", rate_hz=described.rate_hz, splits=described.splits,
+                                   camera=described.camera, lidar=described.lidar, contract=described.contract)
+    for sequence in source.sequences:
+        run = plain_writer.RunWriter(tmp_path / "copy", sequence.split, sequence.name)
+        for index in range(sequence.length):
+            run.write(source.read(sequence, index))
+        run.close()
+    copy = opened(tmp_path / "copy")
+    assert copy.description == dataclasses.replace(described, name="copy", kind="plain", notes=())
+    for ours, theirs in zip(copy.sequences, source.sequences, strict=True):
+        for index in range(theirs.length):
+            expected, frame = source.read(theirs, index), copy.read(ours, index)
+            assert expected.keys() == frame.keys()
+            for name, value in expected.items():
+                np.testing.assert_array_equal(frame[name], value, err_msg=name)
+    first, second = (copy.read(sequence, 1) for sequence in copy.sequences)
+    assert first["intrinsics"][0, 0] + 1 == second["intrinsics"][0, 0]  # of the cars of the two scenes
+    assert first["camera_to_ego"][0, 3] != np.float32(described.camera.camera_to_ego[0][3])
+
+
 def test_the_doctor_takes_missing_archives_for_no_fault(tmp_path, capsys):
     root = writer.write(tmp_path / "set", scenes=("scene-0061", "scene-0553", "scene-0103"))
     remove_files(root, "s*/*/n001__*")
@@ -415,6 +439,26 @@ def test_frames_are_what_a_model_eats(root):
     assert frame["image"].shape == (*config.model.image_size, 3)
     assert (frame["range_view"][..., 3] > 0).sum() > 50
     assert {0, 1, 255} == set(np.unique(frame["occupancy"]))
+
+
+def test_every_row_of_the_town_presets_range_view_is_one_beam(root):
+    """Points in the middle of the lidar's 32 beams, all around: each lies in a row of its own, and none is empty."""
+    recording = opened(root)
+    elevations_rad = np.radians(np.linspace(-92 / 3, 32 / 3, 32))
+    azimuths_rad = np.radians(np.arange(0.0, 360.0))
+    elevation_rad, azimuth_rad = (values.ravel() for values in np.meshgrid(elevations_rad, azimuths_rad, indexing="ij"))
+    flat_m = 9.0 * np.cos(elevation_rad)
+    points = np.stack([flat_m * np.cos(azimuth_rad), flat_m * np.sin(azimuth_rad), 9.0 * np.sin(elevation_rad),
+                       np.full(len(flat_m), 17.0), np.repeat(np.arange(32), len(azimuths_rad))], axis=1)
+    points.astype(np.float32).tofile(root / f"samples/LIDAR_TOP/n000__LIDAR_TOP__{writer.START_US}.pcd.bin")
+    config, notes = fitting.adapt(presets.get("town"), recording)
+    assert config.model.range_view.rows == 32
+    assert "range views have 32 rows instead of 64: the lidar has 32, and more would be empty." in notes
+    view = prepare.prepare_frame(recording.read(recording.sequences[0], 0), config)["range_view"]
+    ranges_m = view[..., 3]
+    assert (ranges_m > 0).mean() > 0.9 and (ranges_m > 0).any(axis=1).all()
+    seen_rad = np.arcsin((view[..., 2] - 1.84) / np.where(ranges_m > 0, ranges_m, np.nan))
+    np.testing.assert_allclose(np.nanmean(seen_rad, axis=1), elevations_rad[::-1], atol=1e-3)
 
 
 def test_a_scene_is_made_of_its_own_files_and_the_tables(root):

@@ -13,6 +13,7 @@ from muvo_jax import config as config_lib
 from muvo_jax import presets
 from muvo_jax.data import fitting, pipeline, schema, sources, windows
 from muvo_jax.data.packed import reader as packed_reader
+from muvo_jax.data.packed import records
 from muvo_jax.data.packed import writer as packed_writer
 from muvo_jax.data.plain import writer as plain_writer
 
@@ -145,11 +146,54 @@ def test_pictures_are_packed_as_the_camera_was_held(tmp_path):
     assert image[:4].max() < 60 and image[-4:].min() > 190
 
 
-def test_a_manifest_from_before_is_still_read(tmp_path):
-    root = writers.write_plain(tmp_path / "source", {"train/a": 6})
+def save_in_every_way(folder):
+    """The frames of a run as PNG and JPEG of every kind that is read, and a BMP that calls itself one."""
+    rng = np.random.default_rng(0)
+    smooth = Image.fromarray(rng.integers(0, 255, (4, 8, 3), np.uint8)).resize((64, 32))
+    exif = Image.Exif()
+    exif[0x0112] = 3  # upside down
+    ways = [(smooth, ".jpg", {}), (smooth, ".jpg", {"exif": exif}), (smooth.convert("L"), ".jpg", {}),
+            (smooth.convert("CMYK"), ".jpg", {}), (smooth, ".jpeg", {"progressive": True}), (smooth, ".png", {}),
+            (smooth, ".png", {"exif": exif}), (smooth.quantize(9), ".png", {}), (smooth.convert("RGBA"), ".png", {}),
+            (smooth.convert("LA"), ".png", {}), (smooth.convert("1"), ".png", {})]
+    for number, (picture, suffix, options) in enumerate(ways):
+        picture.save(folder / f"{number:06d}{suffix}", **options)
+    smooth.save(folder / f"{len(ways):06d}.png", format="BMP")
+    return len(ways)
+
+
+def test_recorded_pictures_are_packed_as_their_bytes(tmp_path):
+    root = writers.write_plain(tmp_path / "source", {"train/a": 12})
+    run = root / "train/a"
+    for path in run.glob("image/*.png"):
+        path.unlink()
+        for folder, pixels in (("depth", np.full((32, 64), 500 + int(path.stem), np.uint16)),
+                               ("classes", np.full((32, 64), int(path.stem) % 10, np.uint8))):
+            (run / folder).mkdir(exist_ok=True)
+            Image.fromarray(pixels).save(run / folder / path.name)
+    kinds = save_in_every_way(run / "image")
     assert packed_writer.pack(root, tmp_path / "out", workers=1)
+    source, packed = (opened(path, schema.LABELS) for path in (root, tmp_path / "out"))
+    assert_equal(source, packed)
+    shard = (tmp_path / "out/shard-00000.arrayrecord").read_bytes()
+    images = sorted((run / "image").iterdir())
+    assert [path.read_bytes() in shard for path in images] == [True] * kinds + [False]  # the BMP becomes a PNG
+    assert all(path.read_bytes() in shard for folder in ("depth", "classes", "route_map")
+               for path in (run / folder).iterdir())
+    assert packed_writer.pack(tmp_path / "out", tmp_path / "again", workers=1)
+    assert (tmp_path / "again/shard-00000.arrayrecord").read_bytes() == shard
+    assert packed_writer.pack(root, tmp_path / "lossy", encoding=records.Encoding(jpeg_quality=50), workers=1)
+    assert images[5].read_bytes() not in (tmp_path / "lossy/shard-00000.arrayrecord").read_bytes()
+
+
+def test_a_pack_from_before_is_still_read(tmp_path, monkeypatch):
+    root = writers.write_plain(tmp_path / "source", {"train/a": 6})
+    with monkeypatch.context() as before:
+        encode = records.encode_frame
+        before.setattr(records, "encode_frame", lambda frame, encoding, _: encode(frame, encoding))
+        assert packed_writer.pack(root, tmp_path / "out", workers=1)
     path = tmp_path / "out/manifest.json"
-    content = json.loads(path.read_text())
+    content = json.loads(path.read_text()) | {"schema_version": 1}
     assert "lacks" not in content["sequences"][0]  # as ever, where nothing is lacking
     del content["description"]["route_map"]
     path.write_text(json.dumps(content))

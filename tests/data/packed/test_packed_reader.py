@@ -1,6 +1,7 @@
 """Packing: what comes out is what went in, and nothing is lost by kills, damage or a second packer."""
 
 import contextlib
+import io
 import json
 import os
 import pathlib
@@ -282,6 +283,8 @@ def record_of(fields, content):
     {"dtype": "<f8", "shape": [10**6, 10**6], "encoding": "zlib"},
     {"dtype": "<f4", "shape": [4], "encoding": "zlib"},
     {"dtype": "|u1", "shape": [4, 4, 3], "encoding": "png"},
+    {"dtype": "|u1", "shape": [4, 4, 3], "encoding": "recorded RGB"},
+    {"dtype": "|u1", "shape": [4, 4], "encoding": "recorded None"},
     {"dtype": "|O", "shape": [1], "encoding": "raw"},
     {"dtype": "<f4", "shape": [-1], "encoding": "raw"},
     {"dtype": "nonsense", "shape": [1], "encoding": "raw"},
@@ -298,6 +301,38 @@ def test_records_that_lie_are_data_errors_and_take_no_memory(field):
     for header in ("text", 3, [3], [None], {"a": 1}):
         with pytest.raises(schema.DataError, match="here: damaged"):
             records.decode_frame(record_of(header, b""), "here")
+
+
+def picture(suffix, size=(8, 6)):
+    content = io.BytesIO()
+    Image.radial_gradient("L").resize(size).convert("RGB").save(content, suffix)
+    return content.getvalue()
+
+
+@pytest.mark.parametrize("encoding", ["recorded RGB", "recorded L", "recorded classes", "recorded depth_m", "png"])
+@pytest.mark.parametrize("suffix", ["png", "jpeg"])
+def test_spoilt_bytes_of_pictures_are_data_errors(suffix, encoding):
+    """Whatever their checksum says: changed, cut short, of another size or of a format that is not packed."""
+    rng, whole = np.random.default_rng(0), picture(suffix)
+    contents = [whole[:length] for length in range(0, len(whole), 40)]
+    contents += [picture(suffix, (9, 6)), picture(suffix, (4000, 4000)), picture("bmp"),
+                 b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 8 6\n%%EndComments\nshowpage\n"]
+    for _ in range(60):
+        spoilt = np.frombuffer(whole, np.uint8).copy()
+        spoilt[rng.integers(0, len(spoilt), 3)] = rng.integers(0, 256, 3)
+        contents.append(spoilt.tobytes())
+    shape, dtype = ([6, 8, 3], "|u1") if encoding in ("recorded RGB", "png") else (
+        [6, 8], "<f4" if "depth" in encoding else "|u1")
+    refused = 0
+    for content in contents:
+        field = {"name": "image", "dtype": dtype, "shape": shape, "encoding": encoding, "bytes": len(content)}
+        try:
+            array = records.decode_frame(record_of([field], content), "here")["image"]
+            assert array.shape == tuple(shape) and array.dtype == np.dtype(dtype)
+        except schema.DataError as error:
+            assert "here: damaged" in str(error)
+            refused += 1
+    assert refused >= 5
 
 
 def test_a_spoilt_entry_of_a_shard_is_written_anew(source, packed):

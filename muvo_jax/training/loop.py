@@ -220,8 +220,8 @@ class _Run:
                 if first:
                     self._first_loss(float(metrics["total"]), making_s)
                     pace.restart()
-                elif due.log:
-                    self._log(metrics, pace.mark(settings.steps - self.done))
+                if due.log:
+                    self._log(metrics, None if first else pace.mark(settings.steps - self.done))
                 if due.any_pause and self.done < settings.steps:
                     self._pause(due, feed.get_state())
                     pace.restart()
@@ -256,10 +256,13 @@ class _Run:
                        f"{ready.compilation_s:.1f} s, first step {self.step_times_s[0]:.1f} s; data and compilation "
                        f"overlap where they can)")
 
-    def _log(self, metrics: Mapping, figures: Mapping[str, float]) -> None:
+    def _log(self, metrics: Mapping, figures: Mapping[str, float] | None) -> None:
+        """figures: screen.Pace.mark; None for the first step after a start, which has no pace and its own line."""
         numbers = {name: float(value) for name, value in metrics.items() if name != "finite"}
-        pace = {name: round(value, 4) for name, value in figures.items() if name != "left_s"}
+        pace = {name: round(value, 4) for name, value in (figures or {}).items() if name != "left_s"}
         self.files.log({"kind": "train", "step": self.done, **numbers, **pace})
+        if figures is None:
+            return
         text = screen.figures_text({**numbers, **figures})
         self.show.advance(self.done, text)
         left = screen.duration_text(figures["left_s"])

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Collection
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from muvo_jax import config as config_lib
 from muvo_jax import head as head_lib
@@ -14,7 +14,7 @@ SHORT_RECORDING_FRAMES = 100
 # What a short recording is cut into: 0.4 s observed and 0.4 s imagined at 10 Hz.
 _SHORT = {"stride": 1, "context": 4, "horizon": 4, "frames": 8}
 _SIDE_MULTIPLE = 32
-# What a network has already that is trained: to be kept, with what the user chose, where such a one is fitted.
+# What a trained network was built with: give it to `adapt` to keep, beside what the user chose.
 OF_TRAINED = ("model.range_view.rows",)
 
 
@@ -88,8 +88,9 @@ def _rows(model: config_lib.ModelConfig, lidar: config_lib.RangeViewGeometry) ->
 def _fit_range_view(model: config_lib.ModelConfig, lidar: config_lib.RangeViewGeometry, keep: Collection[str],
                     notes: list[str]) -> config_lib.RangeViewGeometry:
     """The recorded lidar's view, with rows and columns that a model has."""
-    fitted = {name: getattr(model.range_view, name) if f"model.range_view.{name}" in keep else rule(model, lidar)
-              for name, rule in (("rows", _rows), ("columns", _columns))}
+    fitted: dict[str, Any] = {
+        name: getattr(model.range_view, name) if f"model.range_view.{name}" in keep else rule(model, lidar)
+        for name, rule in (("rows", _rows), ("columns", _columns))}
     for name, why in (("rows", "more would be empty"), ("columns", "a pixel holds one return")):
         usual = getattr(model.range_view, name)
         if fitted[name] != usual:

@@ -114,6 +114,8 @@ class Options:
     """Of initialisation, order of the data and sampling."""
     parallel: Annotated[str | None, command_line.shown("{auto,pmap,shard_map}")] = None
     """How devices share a batch: auto takes shard_map where there is more than one."""
+    trace: bool = False
+    """Let JAX's profiler trace five steps into RUN/trace (for XProf or Perfetto)."""
     evaluate: bool = True
     """Judge the trained model on every split and draw a dream at the end."""
     set: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME=VALUE ...")] = ()
@@ -282,7 +284,7 @@ def train(options: Options, show: screen.Screen) -> None:
         config=config, folder=folder, open_recording=lambda: command_line.open_data(config, show), chosen=tuple(chosen),
         resume=options.resume, resume_command=resume_command, started_s=command_line.process_start_s(),
         init=options.init, pretrained=_pretrained(config, options.resume), frozen=frozen_encoder(config),
-        preview=draw_preview if visible else None), show)
+        preview=draw_preview if visible else None, trace=options.trace), show)
     draw_curves(folder)
     if not visible:
         show.line("no head shows anything: there is nothing to draw or to judge.")

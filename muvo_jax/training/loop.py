@@ -29,6 +29,7 @@ from muvo_jax.training import (
     run_folder,
     screen,
     start,
+    timing,
     trainable,
     validation,
 )
@@ -58,6 +59,7 @@ class Job:
       resume_command: what to type to go on, for messages.
       started_s: time.perf_counter() at the start of the command.
       preview: draws pictures at `train.preview_every`.
+      trace: whether the profiler traces some steps into the run's folder.
     """
 
     config: config_lib.Config
@@ -71,6 +73,7 @@ class Job:
     resume_command: str = "python -m muvo_jax.train --resume"
     started_s: float = dataclasses.field(default_factory=time.perf_counter)
     preview: Preview | None = None
+    trace: bool = False
 
 
 @dataclasses.dataclass(frozen=True)
@@ -197,14 +200,17 @@ class _Run:
         self.keeper, self.files, self.validator, self.origin = keeper, files, validator, origin
         self.state, self.done, self.saved = state, done, done if keeper.steps() else None
         self.step_times_s: list[float] = []
+        self.spent = timing.Spent()
         self.unchecked: collections.deque[tuple[int, Mapping]] = collections.deque()
 
     def loop(self, source: pipeline.TrainBatches, making_s: float) -> Outcome:
-        settings, pace = self.config.train, screen.Pace()
+        settings, pace = self.config.train, timing.Pace()
+        trace = timing.Trace(self.job.folder / run_folder.TRACE_FOLDER if self.job.trace else None)
         feed = pipeline.prefetch_to_device(_Placed(source, self.ready.step.place))
         with feed, host.StopRequest() as stop:
             self.show.start(settings.steps, self.done)
             while self.done < settings.steps and not stop.requested:
+                trace.begin(len(self.step_times_s))
                 start_s, waited_s = time.perf_counter(), feed.waited_s
                 batch = next(feed)
                 self.state, metrics = self.ready.step(self.state, batch)
@@ -212,11 +218,13 @@ class _Run:
                 self.done += 1
                 metrics["finite"].copy_to_host_async()
                 self.unchecked.append((self.done, metrics))
-                due = _due(self.done, settings)
+                due = timing.due(self.done, settings)
                 at_once = first or due.log or due.any_pause or self.done == settings.steps
                 self._check(0 if at_once else _STEPS_LATE)
                 self.step_times_s.append(time.perf_counter() - start_s)
+                self.spent.add(data=feed.waited_s - waited_s, steps=self.step_times_s[-1] - feed.waited_s + waited_s)
                 pace.step(feed.waited_s - waited_s)
+                self._tell(trace.end(len(self.step_times_s) - 1, self.state))
                 if first:
                     self._first_loss(float(metrics["total"]), making_s)
                     pace.restart()
@@ -226,8 +234,13 @@ class _Run:
                     self._pause(due, feed.get_state())
                     pace.restart()
             self._check(0)
+            self._tell(trace.end(None, self.state))
             self._finish(stop.requested, feed.get_state())
         return Outcome(self.config, self.done, stop.requested and self.done < settings.steps)
+
+    def _tell(self, line: str | None) -> None:
+        if line is not None:
+            self.show.line(line)
 
     def _check(self, late: int) -> None:
         """Looks at all steps but the last `late`: neither does the device wait for the host, nor do batches pile up.
@@ -268,16 +281,21 @@ class _Run:
         left = screen.duration_text(figures["left_s"])
         self.show.log(f"step {self.done}/{self.config.train.steps}  {text}  ETA {left}")
 
-    def _pause(self, due: _Due, data_state) -> None:
+    def _pause(self, due: timing.Due, data_state) -> None:
         """Validation, pictures and a checkpoint, as far as they are due."""
         score = self._validate() if due.validate else None
         if due.preview:
             self._preview()
         if due.checkpoint:
             self._save(data_state, score)
+        self.files.log({"kind": "time", "step": self.done, **self.spent.seconds()})
 
     def _validate(self) -> float | None:
         """Returns the mean skill of the validation splits, the higher the better; None where it is undefined."""
+        with self.spent.on("validation"):
+            return self._validated()
+
+    def _validated(self) -> float | None:
         scores = []
         for split in self.validator.splits:
             numbers = self.validator.run(self.state, split)
@@ -289,12 +307,14 @@ class _Run:
 
     def _preview(self) -> None:
         if self.job.preview is not None:
-            name = f"step_{self.done:06d}"
-            self.job.preview(self.job.folder / run_folder.PREVIEW_FOLDER, self.validator, self.state.variables, name)
+            with self.spent.on("pictures"):
+                self.job.preview(self.job.folder / run_folder.PREVIEW_FOLDER, self.validator, self.state.variables,
+                                 f"step_{self.done:06d}")
 
     def _save(self, data_state, score: float | None = None) -> None:
-        self.keeper.save(self.done, self.state, config=self.config, data_state=data_state, score=score,
-                         provenance=self.origin)
+        with self.spent.on("checkpoints"):
+            self.keeper.save(self.done, self.state, config=self.config, data_state=data_state, score=score,
+                             provenance=self.origin)
         self.saved = self.done
 
     def _finish(self, stopped: bool, data_state) -> None:
@@ -313,27 +333,10 @@ class _Run:
             mean_s, age_s = sum(steady_s) / len(steady_s), time.perf_counter() - self.job.started_s
             self.show.line(f"{words.counted(len(self.step_times_s), 'step')}, {mean_s:.3f} s each on average; peak "
                            f"memory {host.peak_memory_gib():.2f} GiB; {screen.duration_text(age_s)} since the start")
+            self.show.line(f"time went into {self.spent.text()}")
+            self.files.log({"kind": "time", "step": self.done, **self.spent.seconds()})
         elif not self.step_times_s:
             self.show.line(f"nothing left to train: step {self.done} of {total} is reached (more with --steps).")
-
-
-@dataclasses.dataclass(frozen=True)
-class _Due:
-    log: bool
-    validate: bool
-    checkpoint: bool
-    preview: bool
-
-    @property
-    def any_pause(self) -> bool:
-        return self.validate or self.checkpoint or self.preview
-
-
-def _due(step: int, settings: config_lib.TrainConfig) -> _Due:
-    def every(period):
-        return period > 0 and step % period == 0
-    return _Due(every(settings.log_every), every(settings.validate_every), every(settings.checkpoint_every),
-                every(settings.preview_every))
 
 
 class _Placed:

@@ -17,6 +17,7 @@ from muvo_jax.training import checkpoint
 CONFIG_FILE = "config.json"
 METRICS_FILE = "metrics.jsonl"
 PREVIEW_FOLDER = "previews"
+TRACE_FOLDER = "trace"
 
 
 class RunFolder:

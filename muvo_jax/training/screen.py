@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import os
 import sys
-import time
 from collections.abc import Callable, Iterator, Mapping
 
 import rich.console
@@ -95,32 +94,6 @@ class Screen:
         if self._bar is not None:
             self._bar.stop()
             self._bar = None
-
-
-class Pace:
-    """Steps per second, the share of time spent waiting for data, and the time left, since the last `mark`."""
-
-    def __init__(self):
-        self._since_s = time.perf_counter()
-        self._steps = 0
-        self._waited_s = 0.0
-
-    def step(self, waited_s: float) -> None:
-        self._steps += 1
-        self._waited_s += waited_s
-
-    def mark(self, left: int) -> dict[str, float]:
-        """The figures since the last mark, for `left` steps to go; starts anew."""
-        elapsed_s = max(time.perf_counter() - self._since_s, 1e-9)
-        rate_hz = self._steps / elapsed_s
-        figures = {"steps_per_s": rate_hz, "waiting_percent": 100.0 * self._waited_s / elapsed_s,
-                   "left_s": left / rate_hz if rate_hz else float("nan")}
-        self.restart()
-        return figures
-
-    def restart(self) -> None:
-        """Forgets what was measured, so that validation does not count as slow training."""
-        self._since_s, self._steps, self._waited_s = time.perf_counter(), 0, 0.0
 
 
 def figures_text(numbers: Mapping[str, float]) -> str:

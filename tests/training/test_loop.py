@@ -119,7 +119,7 @@ def _losses(folder):
     """Everything that was logged and does not depend on the clock."""
     clock = {"steps_per_s", "waiting_percent"}
     return [{name: value for name, value in record.items() if name not in clock}
-            for record in run_folder.read_metrics(folder)]
+            for record in run_folder.read_metrics(folder) if record["kind"] != "time"]
 
 
 def _final(folder):
@@ -149,6 +149,23 @@ def test_a_run_leaves_its_files_and_says_what_it_does(uninterrupted):
     assert list(folder.glob("events.*"))
     for part in ("memory", "RV-WOB-TR", "parameters", str(folder), "first loss", "compilation", "peak memory"):
         assert part in text
+
+
+def test_a_run_says_what_its_time_went_into(uninterrupted):
+    records = [record for record in run_folder.read_metrics(uninterrupted[0]) if record["kind"] == "time"]
+    assert [record["step"] for record in records] == [2, 3, 4, STEPS]  # after every pause, and at the end
+    for part in ("data_s", "steps_s", "validation_s", "checkpoints_s"):
+        spent = [record.get(part, 0.0) for record in records]
+        assert spent == sorted(spent) and spent[-1] > 0.0
+    assert "time went into" in uninterrupted[3]
+
+
+def test_some_steps_are_traced_where_asked_for(tmp_path):
+    show = Interrupting()
+    _train(tmp_path / "run", show, trace=True)
+    written = list((tmp_path / "run" / run_folder.TRACE_FOLDER).rglob("*.xplane.pb"))
+    assert len(written) == 1 and written[0].stat().st_size > 1000
+    assert show.output.getvalue().count("traced steps into") == 1
 
 
 def test_validation_reports_loss_and_imagined_scores(uninterrupted):

@@ -189,14 +189,14 @@ def test_branches_and_times_are_decoded_as_one_by_one():
     assert dream.states.vantage.steps[0, 0].tolist() == [1, 2, 3, 4, 5]
     whole = decode(model, variables, observed, dream.states)
     assert whole["image"].shape == (BATCH, branches, horizon, *model.config.image_size, 3)
-    for drive in range(BATCH):
-        one = decode(model, variables, observed, dream.states[drive, 1], rows=np.full(horizon, drive))
-        assert_same(one, {head: value[drive, 1] for head, value in whole.items()})
+    for step in range(horizon):
+        one = decode(model, variables, observed, dream.states[:, 1, step])
+        assert_same(one, {head: value[:, 1, step] for head, value in whole.items()})
     single = decode(model, variables, observed, dream.states[1, 2, 3], ("image",), rows=np.int32(1))
     assert_same(single, {"image": whole["image"][1, 2, 3]})
     # From every frame of a window: a dream from an earlier one looks at what was seen until then.
     early = rollout.imagine(model, variables, KEY, observed.states[:, 1], plans[:, 0], sampled=False)
-    until = observe(model, variables, batch.time_slice(0, 2))
+    until = observe(model, variables, batch.time_slice(0, 2), sampled=False)
     same = rollout.imagine(model, variables, KEY, until.last, plans[:, 0], sampled=False)
     early, same = early.states[:, 1], same.states[:, 1]
     got, want = (look(model.config, seen.memory, jnp.arange(BATCH), states.vantage, GUESSED)[0]
@@ -228,7 +228,7 @@ def test_an_imagined_car_is_where_the_bicycle_brings_it_and_sees_the_memory_from
 def test_every_guessed_head_answers_to_actions(variant):
     model = model_of(variant)
     batch, variables = batch_of(model.config), fresh(model)
-    observed = observe(model, variables, batch, sampled=False)
+    observed = observe(model, variables, batch)
 
     def decoded(plan, weights):
         dream = rollout.imagine(model, variables, KEY, observed.last, plan, sampled=False)

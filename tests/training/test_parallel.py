@@ -96,7 +96,7 @@ def test_accumulation_averages_the_gradients_of_its_micro_batches():
 
 @functools.cache
 def compiled_step():
-    model, config, _, _ = setting()
+    model, config, _, _ = setting(heads=FEW)
     return step_lib.make_train_step(model, config, parallel="shard_map", devices=jax.devices()[:2])
 
 
@@ -105,7 +105,7 @@ def copy_of(state):
 
 
 def test_one_trace_serves_many_steps():
-    model, _, batch, state = setting()
+    model, _, batch, state = setting(heads=FEW)
     step, state = compiled_step(), copy_of(state)
     state, _ = step(state, batch)
     traced = len(TRACES)
@@ -119,7 +119,7 @@ def test_one_trace_serves_many_steps():
 
 
 def test_a_step_replays_exactly_from_its_state():
-    _, _, batch, state = setting()
+    _, _, batch, state = setting(heads=FEW)
     step = compiled_step()
     state, _ = step(copy_of(state), batch)
     (first, first_metrics), (second, second_metrics) = step(copy_of(state), batch), step(copy_of(state), batch)
@@ -132,7 +132,7 @@ def test_a_step_replays_exactly_from_its_state():
 
 
 def test_a_loss_that_is_not_finite_changes_nothing_but_the_step():
-    _, _, batch, state = setting()
+    _, _, batch, state = setting(heads=FEW)
     broken = batch.replace(action=np.full_like(batch.action, np.nan))
     after, metrics = compiled_step()(copy_of(state), broken)
     assert float(metrics["finite"]) == 0.0
@@ -188,8 +188,13 @@ def test_some_frames_of_each_window_are_decoded_and_others_in_the_next_step():
 def test_imagined_frames_follow_from_the_last_observed_one():
     model, config, batch, state = setting(heads=FEW)
     keys = step_lib.sample_keys(jax.random.key(1), 0, 0, small_world.WINDOWS, None)
-    observed, _ = rollout.observe_window(model, state.variables, batch.time_slice(0, 2), keys, train=True)
-    features = step_lib._and_imagined(model, state.variables, observed, batch.action, keys).features
+
+    @jax.jit
+    def walk(variables, batch):
+        observed, _ = rollout.observe_window(model, variables, batch.time_slice(0, 2), keys, train=True)
+        return observed, step_lib._and_imagined(model, variables, observed, batch.action, keys).features
+
+    observed, features = walk(state.variables, batch)
     # By hand: action[1] leads from the last observed frame, 1, to frame 2; h does not depend on the noise.
     noise = jnp.zeros_like(observed.last.stochastic)
     expected, _ = model.imagine_step(state.variables, noise, observed.last, batch.action[:, 1])
@@ -201,8 +206,8 @@ def test_imagined_frames_follow_from_the_last_observed_one():
 def test_only_the_observed_frames_reach_the_encoder():
     model, config, batch, state = setting(heads=FEW)
     keys = step_lib.sample_keys(jax.random.key(1), 0, 0, small_world.WINDOWS, None)
-    statistics = lambda some: step_lib.forward(state.params, state.batch_stats, some, keys, model=model, config=config,
-                                               train=True, axis_name=None)[1][1]
+    statistics = jax.jit(lambda some: step_lib.forward(
+        state.params, state.batch_stats, some, keys, model=model, config=config, train=True, axis_name=None)[1][1])
     unseen = batch.replace(range_view=np.concatenate([batch.range_view[:, :2], 0 * batch.range_view[:, 2:]], axis=1))
     seen = batch.replace(range_view=np.concatenate([0 * batch.range_view[:, :2], batch.range_view[:, 2:]], axis=1))
     before = jax.tree.leaves(statistics(batch))

@@ -139,6 +139,7 @@ def test_a_full_disk_is_named_and_leaves_no_folder(tmp_path, monkeypatch):
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("fast_compilation")
 def test_a_converted_run_is_judged_dreams_and_trains_on(tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     state_dict = names.reference_state_dict(drawn_variables(TINY.model), TINY.model)

@@ -1,5 +1,6 @@
 """Recordings of other people's kinds: what is found, what is refused by name; what a run lacks takes nothing away."""
 
+import re
 import shutil
 import warnings
 
@@ -292,6 +293,36 @@ def test_a_column_that_one_run_lacks_is_not_switched_off_for_the_others(tmp_path
 def test_descriptions_that_cannot_be_are_refused_by_name(tmp_path, changes, message):
     with pytest.raises(schema.DataError, match=f"recording.toml.*{message}"):
         plain_reader.PlainRecording(writers.write_plain(tmp_path, {"train/a": 2}, **changes))
+
+
+def spoil(old, new):
+    def change(root):
+        for table in root.glob("*/*/frames.csv"):
+            assert old in table.read_text()
+            table.write_text(table.read_text().replace(old, new))
+    return change
+
+
+def rename_folder(old, new):
+    return lambda root: (root / old).rename(root / new)
+
+
+@pytest.mark.parametrize(("change", "header", "message"), [
+    (spoil("\n1,0.1,", "\n1_0,0.1,"), {}, "line 3: frame_id is '1_0', expected a whole number"),
+    (spoil("\n1,0.1,", "\n\u0661,0.1,"), {}, "line 3: frame_id is '\u0661', expected a whole number"),
+    (spoil("5.5", "5_5.0"), {}, "line 2: speed_mps is '5_5.0', expected a finite number"),
+    (rename_folder("train/a/image", "train/a/Image"), {}, "train/a/Image: expected the name image. Rename"),
+    (rename_folder("train", "Train"), {}, "Train: expected the name train, as recording.toml says. Rename"),
+    (rename_folder("train/a/lidar", "train/a/LIDAR"), {}, "train/a/LIDAR: expected the name lidar. Rename"),
+    (lambda root: None, {"splits": '["train", "../other"]'}, "splits has '../other', expected names of folders"),
+    (lambda root: None, {"splits": '["train", "/etc"]'}, "splits has '/etc', expected names of folders"),
+    (lambda root: None, {"splits": '["train", ".."]'}, "splits has '..', expected names of folders"),
+])
+def test_names_and_numbers_that_only_python_or_one_system_takes_are_refused(tmp_path, change, header, message):
+    root = writers.write_plain(tmp_path, {"train/a": 2}, **header)
+    change(root)
+    with pytest.raises(schema.DataError, match=re.escape(message)):
+        sources.open_recording(root)
 
 
 def test_one_rate_is_said_once(tmp_path):

@@ -147,7 +147,12 @@ def read_npz(path: pathlib.Path, name: str) -> np.ndarray:
       DataError: where the file is missing, damaged or lacks the array.
     """
     try:
-        with path.open("rb") as file, np.load(file, allow_pickle=False) as arrays:
+        with path.open("rb") as file:
+            if file.read(len(np.lib.format.MAGIC_PREFIX)) == np.lib.format.MAGIC_PREFIX:
+                raise schema.DataError(f"{path}: a single array (NPY) under the name of an NPZ file; write it with "
+                                       f"np.savez and the name {name!r}.")
+            file.seek(0)
+            arrays = np.load(file, allow_pickle=False)
             if name not in arrays:
                 raise schema.DataError(f"{path}: holds {', '.join(arrays) or 'nothing'}, expected an array {name!r}.")
             return arrays[name]

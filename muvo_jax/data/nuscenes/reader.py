@@ -20,6 +20,7 @@ import math
 import os
 import pathlib
 import warnings
+from collections.abc import Collection
 
 import numpy as np
 
@@ -84,6 +85,10 @@ class NuScenesRecording:
 
     def read(self, sequence: schema.Sequence, index: int) -> schema.RawFrame:
         """See schema.Recording."""
+        return self.read_fields(sequence, index, self.description.modalities)
+
+    def read_fields(self, sequence: schema.Sequence, index: int, names: Collection[str]) -> schema.RawFrame:
+        """See schema.ReadsFields."""
         scene, row = self._scenes[sequence.name], sequence.start + index
         frame: schema.RawFrame = {
             "speed_mps": np.float32(scene.motion.speed_mps[row]),
@@ -93,7 +98,7 @@ class NuScenesRecording:
             "timestamp_s": np.float64(scene.times_s[row]),
             "frame_id": np.int64(scene.time_us[row]),
         }
-        if self._has(sequence, "image"):
+        if "image" in names and self._has(sequence, "image"):
             path = self._path(scene, "image", row)
             frame["image"] = files.read_image(path, "RGB")
             if frame["image"].shape[:2] != (scene.camera.height_px, scene.camera.width_px):
@@ -102,7 +107,7 @@ class NuScenesRecording:
                                        f"the original pictures.")
             frame["intrinsics"] = np.asarray(scene.camera.intrinsics, np.float32)
             frame["camera_to_ego"] = scene.camera_to_ego[row].astype(np.float32)
-        if self._has(sequence, "points_m"):
+        if "points_m" in names and self._has(sequence, "points_m"):
             frame["points_m"] = scans.read_scan(self._path(scene, "points_m", row), scene.lidar_to_ego)
         return frame
 

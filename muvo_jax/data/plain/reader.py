@@ -28,6 +28,7 @@ from __future__ import annotations
 import dataclasses
 import pathlib
 import warnings
+from collections.abc import Collection
 from typing import Any
 
 import numpy as np
@@ -124,11 +125,15 @@ class PlainRecording:
 
     def read(self, sequence: schema.Sequence, index: int) -> schema.RawFrame:
         """See schema.Recording."""
+        return self.read_fields(sequence, index, fields.FIELDS)
+
+    def read_fields(self, sequence: schema.Sequence, index: int, names: Collection[str]) -> schema.RawFrame:
+        """See schema.ReadsFields; what stands in frames.csv is always there."""
         run, position = self._runs[sequence.name], sequence.start + index
         frame: dict[str, Any] = {name: self._of_table(run, name, position) for name in fields.FIELDS
                                  if self._has(sequence, name) and fields.FIELDS[name].columns and name not in _OF_IMAGE}
         for name in fields.FIELDS:
-            if self._has(sequence, name) and fields.FIELDS[name].folder:
+            if name in names and self._has(sequence, name) and fields.FIELDS[name].folder:
                 frame |= self._of_file(run, name, position, frame)
         camera = self.description.camera
         if "image" in frame and camera is not None:

@@ -64,6 +64,9 @@ class NuScenesRecording:
         folder = _tables_folder(path)
         self._root = folder.parent
         self._folder = folder
+        for entry in self._root.iterdir():
+            if entry.name != entry.name.lower() and entry.name.lower() in ("samples", "sweeps"):
+                raise schema.DataError(f"{entry}: expected the name {entry.name.lower()}. Rename the folder.")
         every = _scenes(folder, camera, key_frames=key_frames)
         self._scenes = {scene.name: scene for scene in self._downloaded(every, camera, key_frames=key_frames)}
         period_s = _period_s(list(self._scenes.values()))

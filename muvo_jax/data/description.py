@@ -63,6 +63,19 @@ def names(header: dict, name: str, path: pathlib.Path) -> tuple[str, ...]:
     return tuple(found)
 
 
+def splits(header: dict, path: pathlib.Path) -> tuple[str, ...]:
+    """The entry `splits`: names of folders in the recording.
+
+    Raises:
+      DataError: as `names`, or for what is no name of a folder.
+    """
+    found = names(header, "splits", path)
+    for name in found:
+        if name in (".", "..") or set("/\\\0:") & set(name):
+            raise schema.DataError(f"{path}: splits has {name!r}, expected names of folders that lie beside this file.")
+    return found
+
+
 def contract(header: dict, path: pathlib.Path, rate_hz: float) -> config_lib.ActionContract | None:
     """The section [action]; its rate_hz may be left out. None where there is no such section.
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import contextvars
 import io
-import json
 import os
 import pathlib
 import struct
@@ -15,9 +14,10 @@ import warnings
 import zipfile
 import zlib
 from collections.abc import Iterator, Mapping, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
+import tomli_w
 from PIL import Image, ImageOps
 
 from muvo_jax.data import schema
@@ -147,7 +147,12 @@ def read_npz(path: pathlib.Path, name: str) -> np.ndarray:
       DataError: where the file is missing, damaged or lacks the array.
     """
     try:
-        with path.open("rb") as file, np.load(file, allow_pickle=False) as arrays:
+        with path.open("rb") as file:
+            if file.read(len(np.lib.format.MAGIC_PREFIX)) == np.lib.format.MAGIC_PREFIX:
+                raise schema.DataError(f"{path}: a single array (NPY) under the name of an NPZ file; write it with "
+                                       f"np.savez and the name {name!r}.")
+            file.seek(0)
+            arrays = np.load(file, allow_pickle=False)
             if name not in arrays:
                 raise schema.DataError(f"{path}: holds {', '.join(arrays) or 'nothing'}, expected an array {name!r}.")
             return arrays[name]
@@ -271,21 +276,32 @@ def npz_bytes(arrays: Mapping[str, np.ndarray]) -> bytes:
     return content.getvalue()
 
 
-def to_toml(values: Mapping, tables: Mapping[str, Mapping]) -> str:
-    """Formats top-level values and one level of tables; strings, booleans, numbers and nested lists of them."""
-    lines = [f"{name} = {_toml_value(value)}" for name, value in values.items()]
-    for table, entries in tables.items():
-        lines += ["", f"[{table}]"] + [f"{name} = {_toml_value(value)}" for name, value in entries.items()]
-    return "\n".join(lines) + "\n"
-
-
-def _toml_value(value) -> str:
+def _builtin(value: Any) -> Any:
+    """Numbers of NumPy, in tables and lists, as Python's."""
+    if isinstance(value, Mapping):
+        return {name: _builtin(item) for name, item in value.items()}
     if isinstance(value, (list, tuple)):
-        return "[" + ", ".join(_toml_value(item) for item in value) + "]"
-    if isinstance(value, str):
-        return json.dumps(value, ensure_ascii=False)
-    if isinstance(value, (bool, np.bool_)):
-        return "true" if value else "false"
-    if isinstance(value, (float, np.floating)):
-        return repr(float(value))
-    return str(int(value))
+        return [_builtin(item) for item in value]
+    return value.item() if isinstance(value, np.generic) else value
+
+
+def write_description(path: pathlib.Path, values: Mapping, other: str) -> None:
+    """Writes a TOML file of these values; one that says the same stays as it is, comments and all.
+
+    Args:
+      other: what one describes that says something else, for messages.
+
+    Raises:
+      FileExistsError: where there is one that says something else.
+    """
+    text = tomli_w.dumps(_builtin(values))
+    if path.is_file():
+        try:
+            before = read_toml(path)
+        except schema.DataError:
+            before = None
+        if before != tomllib.loads(text):
+            raise FileExistsError(f"{path} describes {other}; choose another folder or remove this one.")
+        return
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_atomically(path, text)

@@ -41,11 +41,19 @@ class Frames:
         self.cache = windows_lib.FrameCache(int(config.data.cache_gib * 2**30))
         self._actions = windows_lib.StepActions(recording)
         self.needs = prepare.needed(config, recording.description.modalities)
+        self._read = {judged: prepare.read_of(config, recording.description.modalities, judged=judged)
+                      for judged in (False, True)}
         self._not_in_all = recording.description.modalities - sequences.in_every_frame(recording) - self.needs
 
-    def get(self, sequence: schema.Sequence, index: int) -> prepare.PreparedFrame:
-        """Frame `index` of `sequence`; called from several threads at once."""
-        return self.cache.get((sequence.name, sequence.start + index), functools.partial(self._make, sequence, index))
+    def get(self, sequence: schema.Sequence, index: int, *, judged: bool = False) -> prepare.PreparedFrame:
+        """Frame `index` of `sequence`; called from several threads at once.
+
+        Args:
+          judged: with what prepare.judged_only names; without, that is not even read.
+        """
+        names = self._read[judged]
+        return self.cache.get((sequence.name, sequence.start + index, names),
+                              functools.partial(self._make, sequence, index, names))
 
     def batch(self, windows: Sequence[windows_lib.Window], *, judged: bool = False) -> types.Batch:
         """The windows, all of one length, as one Batch of NumPy arrays.
@@ -56,7 +64,7 @@ class Frames:
         Raises:
           DataError: for a damaged file, naming it.
         """
-        rows = [[self.get(window.sequence, index) for index in window.indices] for window in windows]
+        rows = [[self.get(window.sequence, index, judged=judged) for index in window.indices] for window in windows]
         left_out = {*_HOST_ONLY, *(() if judged else prepare.judged_only(self.config))}
         fields: dict[str, np.ndarray] = {}
         for name, example in rows[0][0].items():
@@ -82,11 +90,12 @@ class Frames:
         """Their actions, float32 [B, T, 2]."""
         if self.config.contract.step_action == "mean":
             return np.stack([self._actions.mean(window) for window in windows])
-        return np.stack([np.stack([self.get(window.sequence, index)["action"] for index in window.indices])
+        return np.stack([np.stack([self.get(window.sequence, index, judged=True)["action"] for index in window.indices])
                          for window in windows])
 
-    def _make(self, sequence: schema.Sequence, index: int) -> prepare.PreparedFrame:
-        raw = self.recording.read(sequence, index)
+    def _make(self, sequence: schema.Sequence, index: int, names: frozenset[str]) -> prepare.PreparedFrame:
+        raw = (self.recording.read_fields(sequence, index, names) if isinstance(self.recording, schema.ReadsFields) else
+               self.recording.read(sequence, index))
         for name in self._not_in_all:  # frames of one batch have the same fields
             raw.pop(name, None)  # type: ignore[misc]
         return prepare.prepare_frame(raw, self.config)

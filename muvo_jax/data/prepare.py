@@ -83,6 +83,17 @@ def judged_only(config: config_lib.Config) -> frozenset[str]:
     return _JUDGED - head_lib.targets(config).keys()
 
 
+def read_of(config: config_lib.Config, modalities: Collection[str], *, judged: bool) -> frozenset[str]:
+    """The keys of RawFrame that `prepare_frame` looks at; without those of `judged_only` where nobody judges."""
+    targets = head_lib.targets(config)
+    names = needed(config, modalities) | recorded(targets) | {"reward", "is_terminal", "speed_mps"}
+    if "range_view_classes" in targets:
+        names |= {"points_m"}
+    if judged:
+        names |= {"pose", "image_moving_mask", "occupancy_moving_mask"}
+    return frozenset(names & set(modalities) | {"action", "timestamp_s", "frame_id"})
+
+
 def _moving(raw: schema.RawFrame, ready: PreparedFrame, config: config_lib.Config) -> PreparedFrame:
     """Where road users on the move are, for the modalities that the frame has."""
     masks: PreparedFrame = {}

@@ -20,8 +20,8 @@ from muvo_jax.data.fields import LABELS
 from muvo_jax.limits import RangeError, between, check
 from muvo_jax.ops import camera as camera_ops
 
-__all__ = ["INSTANCE_CLASSES", "LABELS", "Camera", "DataError", "DataWarning", "ListsFiles", "RawFrame", "Recording",
-           "RecordingDescription", "Sequence", "instance_mask"]
+__all__ = ["INSTANCE_CLASSES", "LABELS", "Camera", "DataError", "DataWarning", "ListsFiles", "RawFrame", "ReadsFields",
+           "Recording", "RecordingDescription", "Sequence", "instance_mask"]
 
 _SIDE_PX = between(1, 100_000, "px")
 _RIGID = 0.02  # calibrations are printed with a few digits
@@ -223,6 +223,19 @@ class Recording(Protocol):
 
         Raises:
           DataError: as `read`.
+        """
+        ...
+
+
+@runtime_checkable
+class ReadsFields(Protocol):
+    """A reader that opens no more of a frame than is asked for."""
+
+    def read_fields(self, sequence: Sequence, index: int, names: Collection[str]) -> RawFrame:
+        """Returns of a frame the fields of these names that it has, and those that come with them.
+
+        Raises:
+          DataError: as Recording.read.
         """
         ...
 

@@ -212,7 +212,7 @@ def _survey_plain(path: pathlib.Path, rule: str) -> tuple[Rig, dict[pathlib.Path
     camera, lidar, grid = (description.section(header, name, toml_path, required=True)
                            for name in ("camera", "lidar", "voxels"))
     runs = {}
-    for run in plain_reader.read_runs(path, tuple(description.field(header, "splits", list, toml_path))):
+    for run in plain_reader.read_runs(path, description.splits(header, toml_path)):
         cameras.check(run.columns, camera, run.folder / plain_reader.FRAMES_FILE)
         depths, scans, targets = (plain_reader.frame_files(run, name) for name in ("depth_m", "points_m", "occupancy"))
         runs[run.folder] = [Frame(depths[row], scans[row], targets[row], cameras.of_frame(run.columns, row, camera))

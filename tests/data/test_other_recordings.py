@@ -1,5 +1,6 @@
 """Recordings of other people's kinds: what is found, what is refused by name; what a run lacks takes nothing away."""
 
+import re
 import shutil
 import warnings
 
@@ -12,6 +13,7 @@ from muvo_jax import config as config_lib
 from muvo_jax import presets
 from muvo_jax.data import fields, files, fitting, pipeline, prepare, schema, sources, windows
 from muvo_jax.data.kitti import reader as kitti_reader
+from muvo_jax.data.packed import writer as packed_writer
 from muvo_jax.data.plain import reader as plain_reader
 from muvo_jax.data.plain import writer as plain_writer
 
@@ -292,6 +294,77 @@ def test_a_column_that_one_run_lacks_is_not_switched_off_for_the_others(tmp_path
 def test_descriptions_that_cannot_be_are_refused_by_name(tmp_path, changes, message):
     with pytest.raises(schema.DataError, match=f"recording.toml.*{message}"):
         plain_reader.PlainRecording(writers.write_plain(tmp_path, {"train/a": 2}, **changes))
+
+
+def spoil(old, new):
+    def change(root):
+        for table in root.glob("*/*/frames.csv"):
+            assert old in table.read_text()
+            table.write_text(table.read_text().replace(old, new))
+    return change
+
+
+def rename_folder(old, new):
+    return lambda root: (root / old).rename(root / new)
+
+
+@pytest.mark.parametrize(("change", "header", "message"), [
+    (spoil("\n1,0.1,", "\n1_0,0.1,"), {}, "line 3: frame_id is '1_0', expected a whole number"),
+    (spoil("\n1,0.1,", "\n\u0661,0.1,"), {}, "line 3: frame_id is '\u0661', expected a whole number"),
+    (spoil("5.5", "5_5.0"), {}, "line 2: speed_mps is '5_5.0', expected a finite number"),
+    (rename_folder("train/a/image", "train/a/Image"), {}, "train/a/Image: expected the name image. Rename"),
+    (rename_folder("train", "Train"), {}, "Train: expected the name train, as recording.toml says. Rename"),
+    (rename_folder("train/a/lidar", "train/a/LIDAR"), {}, "train/a/LIDAR: expected the name lidar. Rename"),
+    (lambda root: None, {"splits": '["train", "../other"]'}, "splits has '../other', expected names of folders"),
+    (lambda root: None, {"splits": '["train", "/etc"]'}, "splits has '/etc', expected names of folders"),
+    (lambda root: None, {"splits": '["train", ".."]'}, "splits has '..', expected names of folders"),
+])
+def test_names_and_numbers_that_only_python_or_one_system_takes_are_refused(tmp_path, change, header, message):
+    root = writers.write_plain(tmp_path, {"train/a": 2}, **header)
+    change(root)
+    with pytest.raises(schema.DataError, match=re.escape(message)):
+        sources.open_recording(root)
+
+
+def test_a_kitti_folder_in_another_case_and_an_array_that_calls_itself_an_archive_are_named(tmp_path):
+    drive = writers.write_kitti(tmp_path / "kitti", 3)
+    (drive / "image_02").rename(drive / "Image_02")
+    with pytest.raises(schema.DataError, match=r"Image_02: expected the name image_02\. Rename the folder"):
+        sources.open_recording(drive)
+    with (tmp_path / "0.npz").open("wb") as file:
+        np.save(file, np.zeros((5, 3), np.float32))
+    with pytest.raises(schema.DataError, match=r"0.npz: a single array \(NPY\) under the name of an NPZ file"):
+        files.read_npz(tmp_path / "0.npz", "points_m")
+
+
+@pytest.mark.parametrize("is_packed", [False, True])
+def test_no_more_of_a_frame_is_read_than_a_batch_needs(tmp_path, is_packed):
+    root = writers.write_plain(tmp_path / "plain", {"train/a": 8, "val_rl/b": 8})
+    for path in root.glob("*/*/image/*.png"):
+        (path.parents[1] / "moving").mkdir(exist_ok=True)
+        np.savez((path.parents[1] / "moving" / path.name).with_suffix(".npz"),
+                 image_moving_mask=np.ones((32, 64), bool), occupancy_moving_mask=np.zeros((16, 16, 16), bool))
+    if is_packed:
+        assert packed_writer.pack(root, tmp_path / "packed", workers=1)
+        root = tmp_path / "packed"
+    recording = sources.open_recording(root)
+    asked = []
+    read_fields = recording.read_fields
+    recording.read_fields = lambda *place: asked.append(set(place[-1])) or read_fields(*place)
+    tiny = presets.get("tiny")
+    blind = config_lib.override_all(tiny, {"model.camera": "none", "model.heads": ["range_view"], "model.route": False})
+    whole = {"image", "points_m", "occupancy", "route_map"}
+    masks = {"image_moving_mask", "occupancy_moving_mask"}
+    for config, judged, opened in ((tiny, False, whole), (tiny, True, whole | masks), (blind, False, {"points_m"})):
+        asked.clear()
+        frames = pipeline.Frames(recording, fitting.adapt(config, recording).config)
+        window = windows.find_windows(recording, "train", frames=2, stride=1, needs=frames.needs)[0]
+        batch = frames.batch([window], judged=judged)
+        assert (batch.image_moving_mask is not None) == judged
+        with_files = {name for name in fields.FIELDS if fields.FIELDS[name].folder}
+        assert [names & with_files for names in asked] == [opened, opened]
+        read = read_fields(window.sequence, 0, asked[0])
+        assert set(read) & with_files == opened
 
 
 def test_one_rate_is_said_once(tmp_path):

@@ -21,6 +21,7 @@ import math
 import pathlib
 import re
 import warnings
+from collections.abc import Collection
 
 import numpy as np
 
@@ -120,6 +121,10 @@ class KittiRecording:
 
     def read(self, sequence: schema.Sequence, index: int) -> schema.RawFrame:
         """See schema.Recording."""
+        return self.read_fields(sequence, index, self.description.modalities)
+
+    def read_fields(self, sequence: schema.Sequence, index: int, names: Collection[str]) -> schema.RawFrame:
+        """See schema.ReadsFields."""
         drive = self._drives[sequence.name]
         position = sequence.start + index
         frame_id = int(drive.frame_ids[position])
@@ -135,7 +140,7 @@ class KittiRecording:
             "timestamp_s": np.float64(drive.timestamps_s[position]),
             "frame_id": np.int64(frame_id),
         }
-        if drive.camera is not None:
+        if drive.camera is not None and "image" in names:
             image = files.read_image(paths[self._camera], "RGB")
             if image.shape[:2] != (drive.camera.height_px, drive.camera.width_px):
                 raise schema.DataError(f"{paths[self._camera]}: {image.shape[1]}x{image.shape[0]} pixels, but the "
@@ -144,7 +149,7 @@ class KittiRecording:
             frame["image"] = image
             frame["intrinsics"] = np.asarray(drive.camera.intrinsics, np.float32)
             frame["camera_to_ego"] = np.asarray(drive.camera.camera_to_ego, np.float32)
-        if "velodyne_points" in paths:
+        if "velodyne_points" in paths and "points_m" in names:
             frame["points_m"] = read_scan(paths["velodyne_points"])
         return frame
 
@@ -157,7 +162,15 @@ class KittiRecording:
 
 
 def _files(folder: pathlib.Path, sensor: str) -> dict[int, str]:
-    """Frame number -> name of the files of a sensor."""
+    """Frame number -> name of the files of a sensor.
+
+    Raises:
+      DataError: where its folder is there in another case.
+    """
+    if not (folder / sensor).is_dir():
+        for path in folder.iterdir():
+            if path.name.lower() == sensor:
+                raise schema.DataError(f"{path}: expected the name {sensor}. Rename the folder.")
     return files.numbered(folder / sensor / "data", _SUFFIXES.get(sensor, _IMAGE_SUFFIXES))
 
 

@@ -95,14 +95,10 @@ def _check(recording: plain_reader.PlainRecording, source: pathlib.Path) -> None
 def _describe(described: schema.RecordingDescription, out: pathlib.Path) -> None:
     voxels = described.voxels if described.voxels == muvo_reader.VOXELS else None
     route_map = described.route_map if described.route_map != muvo_reader.ROUTE_MAP else None
-    text = files.to_toml({"rate_hz": described.rate_hz, "tags": muvo_tags.OLDER},
-                         description.tables(camera=described.camera, lidar=described.lidar,
-                                            action=described.contract, voxels=voxels, route_map=route_map))
-    path = out / muvo_reader.SENSORS_FILE
-    if path.is_file() and path.read_text(encoding="utf-8") != text:
-        raise FileExistsError(f"{path} describes other sensors; choose another folder or remove this one.")
-    out.mkdir(parents=True, exist_ok=True)
-    files.write_atomically(path, text)
+    files.write_description(out / muvo_reader.SENSORS_FILE, {
+        "rate_hz": described.rate_hz, "tags": muvo_tags.OLDER} | description.tables(
+            camera=described.camera, lidar=described.lidar, action=described.contract, voxels=voxels,
+            route_map=route_map), "other sensors")
 
 
 def _plan(recording: plain_reader.PlainRecording, town: str) -> list[tuple[str, schema.Sequence]]:

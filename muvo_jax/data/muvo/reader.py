@@ -20,6 +20,7 @@ from __future__ import annotations
 import dataclasses
 import math
 import pathlib
+from collections.abc import Collection
 
 import numpy as np
 
@@ -112,9 +113,13 @@ class MuvoRecording:
 
     def read(self, sequence: schema.Sequence, index: int) -> schema.RawFrame:
         """See schema.Recording."""
+        return self.read_fields(sequence, index, self.description.modalities)
+
+    def read_fields(self, sequence: schema.Sequence, index: int, names: Collection[str]) -> schema.RawFrame:
+        """See schema.ReadsFields."""
         run, row = self._runs[sequence.name], sequence.start + index
         described, columns = self.description, self._columns[sequence.name]
-        wanted = {name for name in described.modalities if sequence.has((name,))}
+        wanted = {name for name in described.modalities if name in names and sequence.has((name,))}
         frame: schema.RawFrame = {name: values[row] for name, values in columns.items()  # type: ignore[assignment]
                                   if name in wanted}
         paths = {key: self._path(run, kind, row) for key, kind in self._kinds.items() if key in wanted}

@@ -20,6 +20,7 @@ import math
 import os
 import pathlib
 import warnings
+from collections.abc import Collection
 
 import numpy as np
 
@@ -63,6 +64,9 @@ class NuScenesRecording:
         folder = _tables_folder(path)
         self._root = folder.parent
         self._folder = folder
+        for entry in self._root.iterdir():
+            if entry.name != entry.name.lower() and entry.name.lower() in ("samples", "sweeps"):
+                raise schema.DataError(f"{entry}: expected the name {entry.name.lower()}. Rename the folder.")
         every = _scenes(folder, camera, key_frames=key_frames)
         self._scenes = {scene.name: scene for scene in self._downloaded(every, camera, key_frames=key_frames)}
         period_s = _period_s(list(self._scenes.values()))
@@ -84,6 +88,10 @@ class NuScenesRecording:
 
     def read(self, sequence: schema.Sequence, index: int) -> schema.RawFrame:
         """See schema.Recording."""
+        return self.read_fields(sequence, index, self.description.modalities)
+
+    def read_fields(self, sequence: schema.Sequence, index: int, names: Collection[str]) -> schema.RawFrame:
+        """See schema.ReadsFields."""
         scene, row = self._scenes[sequence.name], sequence.start + index
         frame: schema.RawFrame = {
             "speed_mps": np.float32(scene.motion.speed_mps[row]),
@@ -93,7 +101,7 @@ class NuScenesRecording:
             "timestamp_s": np.float64(scene.times_s[row]),
             "frame_id": np.int64(scene.time_us[row]),
         }
-        if self._has(sequence, "image"):
+        if "image" in names and self._has(sequence, "image"):
             path = self._path(scene, "image", row)
             frame["image"] = files.read_image(path, "RGB")
             if frame["image"].shape[:2] != (scene.camera.height_px, scene.camera.width_px):
@@ -102,7 +110,7 @@ class NuScenesRecording:
                                        f"the original pictures.")
             frame["intrinsics"] = np.asarray(scene.camera.intrinsics, np.float32)
             frame["camera_to_ego"] = scene.camera_to_ego[row].astype(np.float32)
-        if self._has(sequence, "points_m"):
+        if "points_m" in names and self._has(sequence, "points_m"):
             frame["points_m"] = scans.read_scan(self._path(scene, "points_m", row), scene.lidar_to_ego)
         return frame
 

@@ -110,6 +110,10 @@ class PackedRecording:
         """See schema.Recording."""
         return self._read(sequence, index)
 
+    def read_fields(self, sequence: schema.Sequence, index: int, names: Collection[str]) -> schema.RawFrame:
+        """See schema.ReadsFields."""
+        return self._read(sequence, index, names)
+
     def action(self, sequence: schema.Sequence, index: int) -> np.ndarray:
         """See schema.Recording."""
         return self._read(sequence, index, ("action",))["action"]

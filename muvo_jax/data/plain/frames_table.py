@@ -75,7 +75,7 @@ def _frame_ids(cells: list[str], where: list[str]) -> np.ndarray:
     seen: dict[int, str] = {}
     for text, place in zip(cells, where, strict=True):
         try:
-            value = int(text)
+            value = int(text) if _is_plain(text) else -1
         except ValueError:
             value = _whole_float(text)
         if not 0 <= value < 2**63:
@@ -85,6 +85,11 @@ def _frame_ids(cells: list[str], where: list[str]) -> np.ndarray:
                                    f"number of its own.")
         seen[value] = place
     return np.array(list(seen), np.int64)
+
+
+def _is_plain(text: str) -> bool:
+    """Whether a number is written as other programs write it: Python alone takes 1_000 for one."""
+    return text.isascii() and "_" not in text
 
 
 def _whole_float(text: str) -> int:
@@ -102,7 +107,7 @@ def number(text: str, field: fields.Field, where: str) -> float:
         return 0.0
     try:
         value = _WORDS.get(text.lower())
-        value = float(text) if value is None else value
+        value = (float(text) if _is_plain(text) else math.nan) if value is None else value
     except ValueError:
         value = math.nan
     if not math.isfinite(value):

@@ -28,6 +28,7 @@ from __future__ import annotations
 import dataclasses
 import pathlib
 import warnings
+from collections.abc import Collection
 from typing import Any
 
 import numpy as np
@@ -89,13 +90,15 @@ class PlainRecording:
         root = pathlib.Path(path).expanduser()
         toml_path = root / DESCRIPTION_FILE
         header = read_header(root)
-        splits = description.names(header, "splits", toml_path)
+        splits = description.splits(header, toml_path)
         every = read_runs(root, splits)
         rate_hz = description.rate_hz(header, toml_path)
         self._class_names = _class_names(header, toml_path)
         self.stated_classes = self._class_names if "classes" in header else ()
         self._wanted = [field for field in fields.TABLE
                         if field.folder and (not field.is_label or field.name in labels)]
+        for run in every:
+            _check_case(run)
         self._files = {run.name: _files_of(run, self._wanted) for run in every}
         self._runs = {run.name: run for run in every}
         self._has_terminals = any("is_terminal" in run.columns for run in every)
@@ -122,11 +125,15 @@ class PlainRecording:
 
     def read(self, sequence: schema.Sequence, index: int) -> schema.RawFrame:
         """See schema.Recording."""
+        return self.read_fields(sequence, index, fields.FIELDS)
+
+    def read_fields(self, sequence: schema.Sequence, index: int, names: Collection[str]) -> schema.RawFrame:
+        """See schema.ReadsFields; what stands in frames.csv is always there."""
         run, position = self._runs[sequence.name], sequence.start + index
         frame: dict[str, Any] = {name: self._of_table(run, name, position) for name in fields.FIELDS
                                  if self._has(sequence, name) and fields.FIELDS[name].columns and name not in _OF_IMAGE}
         for name in fields.FIELDS:
-            if self._has(sequence, name) and fields.FIELDS[name].folder:
+            if name in names and self._has(sequence, name) and fields.FIELDS[name].folder:
                 frame |= self._of_file(run, name, position, frame)
         camera = self.description.camera
         if "image" in frame and camera is not None:
@@ -259,6 +266,9 @@ def read_runs(root: pathlib.Path, splits: tuple[str, ...]) -> list[Run]:
 
 def _runs_of(root: pathlib.Path, split: str) -> list[Run]:
     """The complete runs of a split, in the order of their names; incomplete ones are left out with a warning."""
+    near = [path for path in root.iterdir() if path.name != split and path.name.lower() == split.lower()]
+    if near and not (root / split).is_dir():
+        raise schema.DataError(f"{near[0]}: expected the name {split}, as {DESCRIPTION_FILE} says. Rename the folder.")
     folders = sorted(path for path in (root / split).glob("*") if path.is_dir() and not path.name.startswith("."))
     incomplete = [folder.name for folder in folders if not (folder / FRAMES_FILE).is_file()]
     if incomplete:
@@ -278,6 +288,15 @@ def frame_files(run: Run, name: str) -> list[pathlib.Path]:
 
 def _file(run: Run, field: fields.Field, frame_id: int, unusual: dict[int, str]) -> pathlib.Path:
     return run.folder / field.folder / unusual.get(frame_id, f"{frame_id:0{_DIGITS}d}{field.suffixes[0]}")
+
+
+def _check_case(run: Run) -> None:
+    """Raises DataError for a folder that would be one of the format's in lower case: its files would not be read."""
+    known = {field.folder for field in fields.TABLE if field.folder}
+    names = {path.name for path in run.folder.iterdir()}
+    for name in sorted(names - known):
+        if name.lower() in known and name.lower() not in names:
+            raise schema.DataError(f"{run.folder / name}: expected the name {name.lower()}. Rename the folder.")
 
 
 def _files_of(run: Run, wanted: list[fields.Field]) -> dict[str, _Files]:

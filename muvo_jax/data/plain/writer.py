@@ -46,18 +46,12 @@ def write_description(root: pathlib.Path | str, *, name: str, rate_hz: float, sp
       FileExistsError: where ROOT holds a different description (runs of different settings must not be mixed).
     """
     root = pathlib.Path(root).expanduser()
-    text = files.to_toml({"schema_version": plain_reader.SCHEMA_VERSION, "name": name, "rate_hz": float(rate_hz),
-                          "splits": list(splits)} | ({"classes": list(classes)} if classes else {}),
-                         description.tables(action=contract, camera=camera, lidar=lidar, voxels=voxels,
-                                            route_map=route_map))
     path = root / plain_reader.DESCRIPTION_FILE
-    if path.exists():
-        if path.read_text(encoding="utf-8") != text:
-            raise FileExistsError(f"{path} describes another recording (other sensors, splits or actions); choose "
-                                  f"another folder or remove this one.")
-        return path
-    root.mkdir(parents=True, exist_ok=True)
-    files.write_atomically(path, text)
+    files.write_description(path, {
+        "schema_version": plain_reader.SCHEMA_VERSION, "name": name, "rate_hz": float(rate_hz),
+        "splits": list(splits)} | ({"classes": list(classes)} if classes else {}) | description.tables(
+            action=contract, camera=camera, lidar=lidar, voxels=voxels, route_map=route_map),
+        "another recording (other sensors, splits or actions)")
     return path
 
 

@@ -2,6 +2,7 @@
 
 import dataclasses
 import re
+import tracemalloc
 import types
 
 import numpy as np
@@ -211,6 +212,14 @@ def test_points_in_centimetres_are_found(tmp_path):
         np.savez(path, points_m=np.random.default_rng(0).uniform(-4000, 4000, (100, 3)).astype(np.float32))
     texts = [finding.text for finding in examination.examine(plain_reader.PlainRecording(root)).findings]
     assert any("are they in metres?" in text for text in texts)
+
+
+def test_points_in_millimetres_are_found_in_little_memory():
+    points_mm = np.random.default_rng(0).uniform(-50_000, 50_000, (500, 3)).astype(np.float32)
+    tracemalloc.start()
+    alignment.find_gaps(points_mm, LIDAR)  # a table of the ground of 50 km would take gigabytes
+    assert tracemalloc.get_traced_memory()[1] < 100_000_000
+    tracemalloc.stop()
 
 
 def test_pixels_and_points_of_unknown_class_are_no_problem(tmp_path):

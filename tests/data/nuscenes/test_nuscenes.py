@@ -461,6 +461,12 @@ def test_every_row_of_the_town_presets_range_view_is_one_beam(root):
     np.testing.assert_allclose(np.nanmean(seen_rad, axis=1), elevations_rad[::-1], atol=1e-3)
 
 
+def test_a_folder_in_another_case_is_named(root):
+    (root / "samples").rename(root / "Samples")
+    with pytest.raises(schema.DataError, match=r"Samples: expected the name samples\. Rename the folder"):
+        sources.open_recording(root)
+
+
 def test_a_scene_is_made_of_its_own_files_and_the_tables(root):
     listed = reader.NuScenesRecording(root).run_files("scene-0103")
     assert len(set(listed)) == len(tables.NAMES) + 21 + 21 and all(path.is_file() for path in listed)

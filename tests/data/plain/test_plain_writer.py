@@ -146,7 +146,17 @@ def test_equal_frames_give_equal_bytes(tmp_path):
         assert path.read_bytes() == (tmp_path / "train/001" / path.relative_to(tmp_path / "train/000")).read_bytes()
 
 
-def test_toml_round_trip():
-    values = {"text": 'quote " backslash \\ tab \t umlaut ü', "whole": 3, "real": 2.0, "tiny": 1e-30, "yes": True,
-              "nested": [[1.0, 2.5], [0.0, -1.0]], "names": ["a", "b"]}
-    assert tomllib.loads(files.to_toml(values, {"table": values})) == {**values, "table": values}
+def test_a_description_is_written_once_and_stays_as_somebody_formatted_it(tmp_path):
+    values = {"text": 'quote " backslash \\ tab \t umlaut ü', "whole": np.int64(3), "real": np.float32(2.0),
+              "tiny": 1e-30, "yes": np.True_, "nested": ((1.0, 2.5), (0.0, -1.0)), "names": ["a", "b"]}
+    path = tmp_path / "new/recording.toml"
+    files.write_description(path, values | {"table": values}, "something else")
+    read = tomllib.loads(path.read_text(encoding="utf-8"))
+    expected = values | {"nested": [[1.0, 2.5], [0.0, -1.0]]}
+    assert read == expected | {"table": expected}
+    text = "# by hand\n" + path.read_text(encoding="utf-8").replace("whole = 3", "whole  =  3")
+    path.write_text(text, encoding="utf-8")
+    files.write_description(path, values | {"table": values}, "something else")
+    assert path.read_text(encoding="utf-8") == text
+    with pytest.raises(FileExistsError, match="describes something else; choose another folder"):
+        files.write_description(path, values, "something else")

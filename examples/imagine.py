@@ -1,4 +1,4 @@
-"""From a trained run to imagined futures: python examples/imagine.py runs/town-tr"""
+"""From a trained run to imagined futures of one moment, braking or going: python examples/imagine.py runs/town-tr"""
 
 import sys
 
@@ -16,12 +16,17 @@ def main(folder: str) -> None:
 
     key_observe, key_imagine = jax.random.split(jax.random.key(0))
     observed = muvo_jax.observe(model, variables, key_observe, past)
-    brake_or_go = jnp.stack([jnp.full((8, 2), -0.5), jnp.full((8, 2), 0.5)])  # [B = 2, horizon = 8, 2]
-    dream = muvo_jax.imagine(model, variables, key_imagine, observed.last, brake_or_go.at[..., 1].set(0.0), branches=16)
-    print("16 futures of 8 steps for 2 starts:", dream.features.shape)
-    predictions = muvo_jax.decode(model, variables, dream.states[:, 0, ::4], heads=("image", "occupancy"),
-                                  memory=observed.memory)
-    print("decoded, 1 branch, every fourth step:", {head: predictions[head].shape for head in predictions})
+    brake, go = jnp.tile(jnp.array([-0.5, 0.0]), (8, 1)), jnp.tile(jnp.array([0.5, 0.0]), (8, 1))  # [8 steps, 2]
+    plans = jnp.stack([jnp.stack([brake, go])] * 2)  # [2 starts, 2 plans, 8 steps, 2]: each start under both plans
+
+    # With the same noise the two futures of a start differ by their actions alone.
+    dream = muvo_jax.imagine(model, variables, key_imagine, observed.last, plans, same_noise=True)
+    print("states of 2 starts under 2 plans of 8 steps:", dream.features.shape)
+    braked, went = (muvo_jax.decode(model, variables, dream.states[:, plan, -1:], heads=("image", "occupancy"),
+                                    memory=observed.memory) for plan in (0, 1))
+    occupied = [jax.nn.softmax(seen.occupancy)[..., 1].mean() for seen in (braked, went)]
+    print(f"after them: mean difference of the images {jnp.abs(braked.image - went.image).mean():.4f}, "
+          f"share of occupied voxels {occupied[0]:.3f} braking, {occupied[1]:.3f} going")
 
 
 if __name__ == "__main__":

@@ -54,8 +54,8 @@ def screen_table(report: Mapping[str, Any]) -> rich.table.Table:
     drives = words.counted(len(report["seeds"]), "drive")
     shown = rich.table.Table(title=f"{drives} of {report['seconds']:g} s", title_justify="left")
     header, *rows = table(report["scores"], ON_SCREEN)
-    for name in header:
-        shown.add_column(name, justify="left" if name == "driver" else "right")
+    for index, name in enumerate(header):  # headers wrap, numbers do not
+        shown.add_column(name, justify="right" if index else "left", min_width=max(len(row[index]) for row in rows))
     for row in rows:
         shown.add_row(*row)
     return shown

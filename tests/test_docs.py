@@ -1,7 +1,8 @@
-"""The Python code of README and docs runs as it stands there, on a run of fresh weights and a tiny town."""
+"""The Python code of README, docs and examples runs as it stands there, on a run of fresh weights and a tiny town."""
 
 import pathlib
 import re
+import runpy
 
 import jax
 import numpy as np
@@ -53,3 +54,16 @@ def test_agents():
     assert names["transition"].reward.shape == () and names["transitions"].reward.shape == (15,)
     assert all(np.isfinite(value).all() for value in (names["transition"].reward, names["transitions"].reward,
                                                       names["metrics"]["actor_loss"]))
+
+
+@pytest.mark.parametrize(("example", "arguments", "printed"), [
+    ("imagine", (), r"states of 2 starts under 2 plans of 8 steps: \(2, 2, 8, "),
+    ("branch_and_score", (), r"collision\n( *-?[\d.]+ +-?[\d.]+ +-?[\d.]+ +-?[\d.]+ +[\d.]+\n){9}"),
+    ("plan", (), r"expected return -?[\d.]+;"),
+    ("train_agent", ("learned", "2"), r"update 2: imagined return -?[\d.]+, .*\nwrote learned"),
+    ("gradient", (), r"step 30: distance [\d.]+, .*\n(\w+: correlation .* driven -?[\d.]+\n){2}")],
+    ids=lambda value: value if isinstance(value, str) and value.isidentifier() else "")
+def test_an_example(example, arguments, printed, capsys):
+    main = runpy.run_path(str(ROOT / "examples" / f"{example}.py"))["main"]
+    main("runs/town-tr", *arguments)
+    assert re.search(printed, capsys.readouterr().out)

@@ -1,5 +1,6 @@
 """One conformance suite for all doors; where a library is not installed its door is skipped (see .ci/run-agents)."""
 
+import copy
 import dataclasses
 
 import jax
@@ -134,6 +135,33 @@ def test_brax_wrappers_truncate_and_reset():
         state = step(state, jnp.stack([ACTION] * 2))
     assert state.done.tolist() == [1, 1] and state.info["truncation"].tolist() == [1, 1]
     np.testing.assert_allclose(state.obs, state.info["first_obs"])
+
+
+def test_brax_shows_decoded_sensors_by_head_and_its_state_holds_no_memory():
+    pytest.importorskip("brax", reason="brax is not installed")
+    from muvo_jax.agents.doors import brax_env
+    core, params = make(observation=("image", "range_view"))
+    env = brax_env.BraxImagination(core, params)
+    start = jax.eval_shape(env.reset, jax.random.PRNGKey(0))
+    after = jax.eval_shape(env.step, start, ACTION)
+    for state in (start, after):
+        assert {name: leaf.shape for name, leaf in state.obs.items()} == env.observation_size
+    assert env.observation_size["image"] == (*MODEL.config.image_size, 3)
+    assert jax.tree.structure(start) == jax.tree.structure(after)
+    held = sum(leaf.size for leaf in jax.tree.leaves(start.pipeline_state))
+    assert held < 2 * MODEL.feature_shape[0] + 20  # the latent and the car, no weights, memory or bank
+
+
+def test_a_gymnasium_environment_copied_mid_drive_goes_on_alike():
+    pytest.importorskip("gymnasium", reason="gymnasium is not installed")
+    from muvo_jax.agents.doors import gymnasium_env
+    env = gymnasium_env.GymnasiumImagination(*make())
+    env.reset(seed=1)
+    env.step(np.array(ACTION))
+    twin = copy.deepcopy(env)
+    (seen, reward, *_), (other, other_reward, *_) = env.step(np.array(ACTION)), twin.step(np.array(ACTION))
+    np.testing.assert_allclose(seen, other, atol=1e-6)
+    assert reward == pytest.approx(other_reward) and env.observation_space.contains(seen)
 
 
 def test_stoa_wrappers_reset_and_keep_the_final_observation():

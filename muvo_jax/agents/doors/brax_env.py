@@ -21,12 +21,9 @@ Base: Any = _base.Env
 
 
 class BraxImagination(Base):
-    """The core as a brax Env; observations must be one vector (observation="features")."""
+    """The core as a brax Env; decoded sensors come as a dict by head."""
 
     def __init__(self, core: environment_lib.Environment, params: environment_lib.EnvParams):
-        if core.observation != "features":
-            raise ValueError(f"BraxImagination: observation is {core.observation!r}; brax's agents read one vector, "
-                             f"'features'.")
         self.core = core
         self._params = params
 
@@ -53,8 +50,10 @@ class BraxImagination(Base):
         return int(self._params.max_steps_in_episode)
 
     @property
-    def observation_size(self) -> int:
-        return self.core.model.policy_feature_channels
+    def observation_size(self) -> int | dict[str, tuple[int, ...]]:
+        """Channels of the vector, or the shape of each head."""
+        shapes = self.core.observation_shapes
+        return {name: leaf.shape for name, leaf in shapes.items()} if isinstance(shapes, dict) else shapes.shape[-1]
 
     @property
     def action_size(self) -> int:

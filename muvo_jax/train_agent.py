@@ -48,7 +48,7 @@ class Options:
     """The run's folder."""
     checkpoint: str = "latest"
     """latest, best (skill of imagined frames, docs/design.md) or a step."""
-    rounds: int = 20
+    rounds: int = 13
     """Rounds of imagining and learning."""
     updates: int = 60
     """Updates of the agent in each round."""
@@ -206,8 +206,8 @@ def draw(path: pathlib.Path, history: list[dict[str, float]]) -> None:
 
     plots = [curves.curve(series({"imagined": "imagined_reward", "town": "town_reward"}), "reward of a step"),
              curves.curve(series({"imagined": "imagined_progress_m", "town": "town_progress_m"}), "metres of a step"),
-             curves.curve(series({"imagined drives that end early": "imagined_ends", "success in the town":
-                                  "town_success"}), "share of drives")]
+             curves.curve(series({"imagined, ended early": "imagined_ends", "town, success": "town_success"}),
+                          "share of drives")]
     curves.write_curves(path, plots, "Learning in imagination, judged in the town; over updates")
 
 

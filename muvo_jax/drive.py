@@ -92,7 +92,7 @@ def drive(options: Options, show: screen.Screen) -> dict[str, Any]:
     loaded = command_line.load_run(options.run, options.checkpoint, show)
     policy = None
     if "learned" in names:
-        policy = policy_file.load(options.policy or loaded.folder / policy_file.FOLDER, loaded).policy()
+        policy = policy_file.load(options.policy or loaded.folder / policy_file.FOLDER, loaded)
     town = simulator.Town(settings.from_config(loaded.config))
     world = town_drive.town_simulator(town, loaded.config)
     drivers = {name: driver_of(name, options, loaded, world, policy, show) for name in names}
@@ -145,7 +145,7 @@ def agents_of(text: str) -> tuple[str, ...]:
 
 
 def driver_of(name: str, options: Options, loaded: run_lib.Run, world: closed_loop.Simulator,
-              policy: jax.tree_util.Partial | None, show: screen.Screen) -> closed_loop.Driver:
+              policy: policy_file.StoredPolicy | None, show: screen.Screen) -> closed_loop.Driver:
     """Who drives under this name; `policy` is that of the learned agent.
 
     Raises:
@@ -154,7 +154,7 @@ def driver_of(name: str, options: Options, loaded: run_lib.Run, world: closed_lo
     if name == "planner":
         return _planner(options, loaded, world, show)
     if policy is not None and name == "learned":
-        return closed_loop.policy_driver(world, loaded.model, loaded.variables, policy)
+        return closed_loop.policy_driver(world, policy.environment(loaded), loaded.variables, policy.policy())
     return {EXPERT: closed_loop.expert_driver(world), "constant": closed_loop.constant_driver(COASTING),
             "random": closed_loop.random_driver()}[name]
 

@@ -4,16 +4,18 @@ from __future__ import annotations
 
 import math
 import pathlib
+import warnings
 from collections.abc import Mapping
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import rich.table
 
 from muvo_jax import evaluation_report
 from muvo_jax import run as run_lib
-from muvo_jax.agents import closed_loop, drive_scores
+from muvo_jax.agents import closed_loop, drive_scores, environment, policy_file
 from muvo_jax.data import words
 from muvo_jax.metrics import baselines, protocol
 from muvo_jax.model import rollout
@@ -97,7 +99,7 @@ def markdown(report: Mapping[str, Any]) -> str:
 
 
 def film(loaded: run_lib.Run, town: simulator.Town, drive: closed_loop.Drive, key: jax.Array,
-         policy: jax.tree_util.Partial | None, horizon: int) -> list[np.ndarray]:
+         policy: policy_file.StoredPolicy | None, horizon: int) -> list[np.ndarray]:
     """Frames of a drive: the town; of a driver with a model also what it makes of that, and what it expects to come.
 
     Args:
@@ -105,7 +107,7 @@ def film(loaded: run_lib.Run, town: simulator.Town, drive: closed_loop.Drive, ke
       town: where it drove.
       drive: with its moments.
       key: of the policy.
-      policy: that of a learned agent, which drives on in imagination for `horizon` steps; a planner has its plans.
+      policy: a learned agent, which drives on in imagination for `horizon` steps; a planner has its plans.
       horizon: see policy.
     """
     scene, pictures = sheets.Scene.of(loaded.config), []
@@ -129,15 +131,29 @@ def _imagined(loaded, drive, key, policy, horizon, scene) -> dict[str, list[shee
     states, memory = closed_loop.latents(drive.moments)
     if policy is None:
         plans = closed_loop.plans(drive.moments)
-        dreamt = rollout.imagine(model, variables, key, states, plans, sampled=False)
+        dreamt = rollout.imagine(model, variables, key, states, plans, sampled=False).states
         title = f"imagined under the plan, in {plans.shape[1] * scene.frame_s:.1f} s"
     else:
-        pooled = lambda key, features: policy(key, model.policy_features(features))
-        dreamt = rollout.imagine(model, variables, key, states, pooled, horizon=horizon, sampled=False)
+        dreamt = _policys_dream(loaded, drive, key, policy, states, memory, horizon)
         title = f"imagined under the policy, in {horizon * scene.frame_s:.1f} s"
     views = {}
-    for name, latent in (("world model, now", states), (title, jax.tree.map(lambda leaf: leaf[:, -1], dreamt.states))):
+    for name, latent in (("world model, now", states), (title, jax.tree.map(lambda leaf: leaf[:, -1], dreamt))):
         decoded = rollout.decode(model, variables, latent, heads, memory=memory)
         frames = jax.device_get(protocol.finish(decoded, model.config))
         views[name] = sheets.views_of_frames({head: value[None] for head, value in frames.items()}, 0)
     return views
+
+
+def _policys_dream(loaded, drive, key, policy, states, memory, horizon):
+    """LatentState [T, H, ...]: how a policy drives on in imagination from each of T moments."""
+    world = policy.environment(loaded)
+    speeds = jnp.concatenate([moment.memory.speed_mps for moment in drive.moments])
+    maps = [moment.memory.route_map for moment in drive.moments]
+    rows = jnp.arange(len(maps))
+    bank = environment.StartBank(states, speeds, None if maps[0] is None else jnp.concatenate(maps), memory, rows)
+    with warnings.catch_warnings():  # as the command says of a planner's horizon
+        warnings.simplefilter("ignore")
+        params = world.params(loaded.variables, bank, horizon, temperature=0.0)
+    first = jax.vmap(world.state_at, (0, None))(rows, params)
+    onward = lambda key, state: environment.play(world, params, key, state, policy.policy(), horizon)[0].latent
+    return jax.vmap(onward)(jax.random.split(key, len(maps)), first)

@@ -1,9 +1,12 @@
 """An actor-critic that learns in imagination alone, after DreamerV3 (Hafner et al. 2023), small enough to read.
 
-Every update imagines `horizon` steps from a batch of start states under the actor, computes lambda returns from the
-critic, and moves both: the critic towards the returns, the actor along the score function, with the returns' spread
+`update` imagines `horizon` steps from a batch of start states under the actor, computes lambda returns from the critic,
+and moves both: the critic towards the returns, the actor along the score function, with the returns' spread
 (percentiles 5 to 95) as scale and entropy as bonus. Differs from DreamerV3: the critic regresses symlog returns by
 squared error, not by two-hot classes, and the world model stays frozen.
+
+`improve` does the same in futures that were imagined before (agents/futures.py), where a step costs a fraction and
+where the car goes has a derivative: part of the actor's gradient is that of the return through the path (DreamerV1).
 """
 
 from __future__ import annotations
@@ -19,6 +22,7 @@ import optax
 from flax import linen
 
 from muvo_jax.agents import environment as environment_lib
+from muvo_jax.agents import futures as futures_lib
 from muvo_jax.limits import COUNT, NOT_NEGATIVE, SHARE, above, check
 from muvo_jax.ops import precision
 from muvo_jax.types import Array
@@ -32,6 +36,8 @@ class ActorCriticConfig:
       starts, horizon: imagined drives per update and their steps.
       width, layers: of both perceptrons.
       target_rate: of the exponential average that gives bootstrap values.
+      score: share of the score function in the actor's gradient in `improve`; the rest is the derivative of the return
+        through the car's path, which steers well but hardly brakes: a probability that has risen to 1 has no slope.
     """
 
     starts: Annotated[int, COUNT] = 64
@@ -45,6 +51,7 @@ class ActorCriticConfig:
     clip_norm: Annotated[float, above(0)] = 100.0
     target_rate: Annotated[float, SHARE] = 0.02
     scale_rate: Annotated[float, SHARE] = 0.01
+    score: Annotated[float, SHARE] = 0.5
 
     def __post_init__(self):
         check(self)
@@ -151,9 +158,17 @@ class _Act:
 
 
 def init(key: Array, environment: environment_lib.Environment, config: ActorCriticConfig) -> Learner:
-    """A fresh learner for observations that are one vector."""
+    """A fresh learner for observations that are one vector, "features" or "road".
+
+    Raises:
+      ValueError: for an environment that observes decoded heads.
+    """
     key_actor, key_critic = jax.random.split(key)
-    observation = jnp.zeros((environment.model.policy_feature_channels,), jnp.float32)
+    shape = environment.observation_shapes
+    if not hasattr(shape, "shape"):
+        raise ValueError(f"actor_critic.init: the environment observes the heads {', '.join(shape)}; expected one "
+                         f"vector, observation=\"features\" or \"road\".")
+    observation = jnp.zeros(shape.shape, jnp.float32)
     actor, critic = _actor(config).init(key_actor, observation), _critic(config).init(key_critic, observation)
     return Learner(actor, critic, critic, jnp.float32(1.0), _optimizer(config).init((actor, critic)), jnp.int32(0))
 
@@ -186,31 +201,68 @@ def update(environment: environment_lib.Environment, config: ActorCriticConfig, 
            key: Array, learner: Learner) -> tuple[Learner, dict[str, Array]]:
     """One update; metrics: "return" and "reward" (means), "entropy", "critic_loss", "actor_loss", "terminated"."""
     seen, drawn, transitions = jax.lax.stop_gradient(imagine(environment, config, params, key, learner.actor))
-    discount = config.discount * (1.0 - transitions.terminated.astype(jnp.float32))
-    slow = _value(config, learner.slow_critic, seen)
-    returns = lambda_returns(transitions.reward, discount, slow[1:], config.lambda_)
-    # Steps after a predicted collision do not count.
-    alive = jnp.cumprod(1.0 - transitions.terminated.astype(jnp.float32), axis=0)
-    weight = jnp.concatenate([jnp.ones_like(alive[:1]), alive[:-1]])
-    spread = jnp.percentile(returns, 95) - jnp.percentile(returns, 5)
-    scale = (1.0 - config.scale_rate) * learner.scale + config.scale_rate * spread
-    advantage = (returns - _value(config, learner.critic, seen[:-1])) / jnp.maximum(scale, 1.0)
+    drives = lambda actor: (seen, drawn, transitions.reward, transitions.terminated)
+    return _learn(config, learner, drives, score=1.0)
+
+
+@functools.partial(jax.jit, static_argnames=("environment", "config"))
+def improve(environment: environment_lib.Environment, config: ActorCriticConfig, futures: futures_lib.Futures,
+            key: Array, learner: Learner) -> tuple[Learner, dict[str, Array]]:
+    """One update from drives through imagined futures, of their horizon, that start scattered; metrics as `update`.
+
+    Raises:
+      ValueError: as futures.check.
+    """
+    futures_lib.check(environment)
+    key_start, key_act = jax.random.split(key)
+    start = futures_lib.scattered(key_start, futures)
+    noise = jax.random.normal(key_act, (futures.horizon, futures.count, environment_lib.ACTION_CHANNELS), jnp.float32)
+
+    def drives(actor):
+        def act(observation, step):
+            mean, std = _moments(config, actor, observation)
+            drawn = mean + std * noise[step]
+            return jnp.tanh(drawn), drawn
+
+        seen, reward, terminated, drawn = futures_lib.drive(environment, futures, start, act)
+        return seen, drawn, reward, terminated
+
+    return _learn(config, learner, drives, score=config.score)
+
+
+def _learn(config, learner, drives, score):
+    """One step of the optimiser. drives: actor -> observations [H + 1, N, F], actions before tanh [H, N, 2], and
+    rewards and ends [H, N]."""
+    hold = jax.lax.stop_gradient
 
     def loss(networks):
         actor, critic = networks
-        mean, std = _moments(config, actor, seen[:-1])
+        seen, drawn, reward, terminated = drives(actor)
+        going_on = 1.0 - terminated.astype(jnp.float32)
+        values = _value(config, learner.slow_critic, seen)
+        returns = lambda_returns(reward, config.discount * going_on, values[1:], config.lambda_)
+        # Steps after a predicted collision do not count.
+        alive = jnp.cumprod(going_on, axis=0)
+        weight = jnp.concatenate([jnp.ones_like(alive[:1]), alive[:-1]])
+        spread = hold(jnp.percentile(returns, 95) - jnp.percentile(returns, 5))
+        scale = (1.0 - config.scale_rate) * learner.scale + config.scale_rate * spread
+        unit = jnp.maximum(scale, 1.0)
+        here = hold(seen[:-1])
+        advantage = hold(returns - _value(config, critic, here)) / unit
+        mean, std = _moments(config, actor, here)
         entropy = jnp.log(std).sum(axis=-1)
-        actor_loss = -(weight * (jax.lax.stop_gradient(advantage) * _log_probability(mean, std, drawn)
-                                 + config.entropy * entropy)).mean()
-        predicted = _critic(config).apply(critic, seen[:-1])[..., 0]
-        critic_loss = (weight * (predicted - symlog(returns)) ** 2).mean()
-        return actor_loss + critic_loss, {"actor_loss": actor_loss, "critic_loss": critic_loss,
-                                          "entropy": entropy.mean()}
+        gain = config.entropy * entropy + score * advantage * _log_probability(mean, std, hold(drawn))
+        if score < 1.0:
+            gain = gain + (1.0 - score) * returns / unit
+        actor_loss = -(weight * gain).mean()
+        predicted = _critic(config).apply(critic, here)[..., 0]
+        critic_loss = (weight * (predicted - symlog(hold(returns))) ** 2).mean()
+        return actor_loss + critic_loss, (scale, {
+            "actor_loss": actor_loss, "critic_loss": critic_loss, "entropy": entropy.mean(),
+            "return": returns[0].mean(), "reward": reward.mean(), "terminated": terminated.mean()})
 
-    gradients, metrics = jax.grad(loss, has_aux=True)((learner.actor, learner.critic))
+    gradients, (scale, metrics) = jax.grad(loss, has_aux=True)((learner.actor, learner.critic))
     updates, opt_state = _optimizer(config).update(gradients, learner.opt_state)
     actor, critic = optax.apply_updates((learner.actor, learner.critic), updates)
     slow_critic = optax.incremental_update(critic, learner.slow_critic, config.target_rate)
-    metrics |= {"return": returns[0].mean(), "reward": transitions.reward.mean(),
-                "terminated": transitions.terminated.mean()}
     return Learner(actor, critic, slow_critic, scale, opt_state, learner.step + 1), metrics

@@ -20,8 +20,6 @@ import numpy as np
 from muvo_jax.agents import environment as environment_lib
 from muvo_jax.agents import planners
 from muvo_jax.model import checks, glimpse, live
-from muvo_jax.model.world_model import WorldModel
-from muvo_jax.ops import motion as motion_ops
 from muvo_jax.types import Array, ArrayLike, LatentState, Memory, Variables
 
 
@@ -91,9 +89,17 @@ class PlanMemory:
 
 @flax.struct.dataclass
 class PolicyMemory:
-    """What a policy's driver remembers: the filter's state, of a batch of one."""
+    """What a policy's driver remembers, of a batch of one.
+
+    Attributes:
+      live: the filter's state.
+      speed_mps, route_map: the newest observation's, [1] and [1, 64, 64] or None; an episode in imagination could start
+        here (`standing`).
+    """
 
     live: live.LiveState
+    speed_mps: Array
+    route_map: Array | None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -226,51 +232,67 @@ def plan_step(environment: environment_lib.Environment, planner: str, config: pl
     """Filters one observation (each field [1, ...]) and plans from there on. The latents are means, not samples."""
     filtered = live.observe_step(environment.model, variables, memory.live, observation, previous_action,
                                  sampled=False)
-    speed_mps, route_map = observation["speed_mps"], observation.get("route_map")
     model_config = environment.model.config
     remembered = glimpse.with_evidence(model_config, filtered.memory, filtered.latent.vantage)  # one for all plans
-    bank = environment_lib.StartBank(filtered.latent, speed_mps, route_map, remembered, jnp.zeros((1,), jnp.int32))
-    horizon = memory.plan.shape[0]
-    params = dataclasses.replace(environment.params(variables, bank, horizon), temperature=temperature)
-    state = environment_lib.EnvState(filtered.latent[0], motion_ops.at_rest_of_frame(speed_mps[0]), jnp.int32(0),
-                                     jnp.int32(0), jnp.float32(0), jnp.bool_(False))
+    params, state = standing(environment, variables, filtered, remembered, observation["speed_mps"],
+                             observation.get("route_map"), memory.plan.shape[0])
+    params = dataclasses.replace(params, temperature=temperature)
     returns = planners.shared_future_returns if shared_future else planners.imagined_returns
     objective = returns(environment, params, state, discount=discount)
     plan = planners.PLANNERS[planner](objective, key, planners.shift(memory.plan), config)
     return PlanMemory(filtered, plan.actions, plan.value)
 
 
-# (key, WorldModel.policy_features [B, P]) -> actions [B, 2] in [-1, 1].
-FeaturePolicy = Callable[[Array, Array], Array]
+# (key, observation [1, ...]) -> actions [1, 2] in [-1, 1].
+Policy = Callable[[Array, Any], Array]
 
 
-def policy_driver(simulator: Simulator, model: WorldModel, variables: Variables, policy: FeaturePolicy, *,
-                  sampled: bool = False) -> Driver:
-    """Drives by a policy that reads what the model makes of the sensors: filter, act; compiled once.
+def policy_driver(simulator: Simulator, environment: environment_lib.Environment, variables: Variables,
+                  policy: Policy, *, sampled: bool = False) -> Driver:
+    """Drives by a policy that reads what the model makes of the sensors: filter, observe, act; compiled once.
 
     Args:
-      simulator: only its `observe` is used; it must give all that the model reads.
-      model, variables: of the run in whose imagination the policy learned.
-      policy: as for Environment.play: (key, model.policy_features [B, P]) -> actions [B, 2], clipped to [-1, 1]. One
-        with parameters comes as jax.tree_util.Partial(function, parameters), as actor_critic.policy makes it, so that
-        new parameters compile nothing anew. Whether it draws its actions or takes its mode is its own affair.
+      simulator: only its `observe` is used; it must give all that the model reads, and speed_mps.
+      environment: in which the policy learned; its observation is what the policy gets.
+      variables: of the model.
+      policy: (key, observation [1, ...]) -> actions [1, 2], clipped to [-1, 1]. One with parameters comes as
+        jax.tree_util.Partial(function, parameters), as actor_critic.policy makes it, so that new parameters compile
+        nothing anew. Whether it draws its actions or takes its mode is its own affair.
       sampled: sample the filter's latents instead of taking their means, which is what planning_driver does.
     """
     driver_policy = policy if isinstance(policy, jax.tree_util.Partial) else jax.tree_util.Partial(policy)
 
     def driver(key, memory, state, previous):
         key_filter, key_policy = jax.random.split(key)
+        model = environment.model
         stream = live.start_live(model, key_filter) if memory is None else memory.live
         observation = {name: np.asarray(value)[None] for name, value in simulator.observe(state).items()}
         stream = live.observe_step(model, variables, stream, observation, previous[None], sampled=sampled)
-        return PolicyMemory(stream), np.asarray(_act(model, driver_policy, key_policy, stream.latent.features)[0])
+        speed_mps, route_map = observation["speed_mps"], observation.get("route_map")
+        action = _act(environment, variables, driver_policy, key_policy, stream, speed_mps, route_map)
+        return PolicyMemory(stream, speed_mps, route_map), np.asarray(action)
 
     return driver
 
 
-@functools.partial(jax.jit, static_argnames=("model",))
-def _act(model: WorldModel, policy: jax.tree_util.Partial, key: Array, features: Array) -> Array:
-    return checks.policy_action(policy(key, model.policy_features(features)), features)
+@functools.partial(jax.jit, static_argnames=("environment",))
+def _act(environment: environment_lib.Environment, variables: Variables, policy: jax.tree_util.Partial, key: Array,
+         stream: live.LiveState, speed_mps: Array, route_map: Array | None) -> Array:
+    params, state = standing(environment, variables, stream, stream.memory, speed_mps, route_map, 1)
+    observation = jax.tree.map(lambda leaf: leaf[None], environment.observe(state, params))
+    return checks.policy_action(policy(key, observation), stream.latent.features)[0]
+
+
+def standing(environment: environment_lib.Environment, variables: Variables, stream: live.LiveState,
+             memory: Memory | None, speed_mps: Array, route_map: Array | None,
+             horizon: int) -> tuple[environment_lib.EnvParams, environment_lib.EnvState]:
+    """An episode that starts where a stream (of a batch of one) stands: its params and first state.
+
+    memory: of the stream, or that with evidence (glimpse.with_evidence).
+    """
+    bank = environment_lib.StartBank(stream.latent, speed_mps, route_map, memory, jnp.zeros((1,), jnp.int32))
+    params = environment.params(variables, bank, horizon)
+    return params, environment.state_at(jnp.int32(0), params)
 
 
 def latents(moments: Sequence[Moment]) -> tuple[LatentState, Memory | None]:

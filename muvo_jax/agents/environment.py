@@ -18,7 +18,7 @@ import jax.numpy as jnp
 
 from muvo_jax import config as config_lib
 from muvo_jax import run as run_lib
-from muvo_jax.agents import episodes, forks, rewards
+from muvo_jax.agents import episodes, forks, rewards, road
 from muvo_jax.agents import route as route_lib
 from muvo_jax.agents.episodes import EnvParams, EnvState, StartBank, Transition
 from muvo_jax.model import checks
@@ -42,7 +42,8 @@ class Environment:
       reward_config: of the driving reward.
       reward_function: instead of it, (Moment) -> (reward, terminated, terms); `reward_heads` are decoded for it.
       reward_heads: heads that the reward reads.
-      observation: "features" (one vector, model.policy_features) or names of heads, decoded at full size.
+      observation: "features" (model.policy_features) or "road" (agents/road.py), one vector each, or names of heads,
+        decoded at full size.
       trained_steps: as many as training imagined, where that is known; `params` warns of longer episodes.
     """
 
@@ -52,7 +53,7 @@ class Environment:
     reward_config: rewards.RewardConfig = rewards.RewardConfig()
     reward_function: RewardFunction | None = None
     reward_heads: tuple[str, ...] | None = None
-    observation: Literal["features"] | tuple[str, ...] = "features"
+    observation: Literal["features", "road"] | tuple[str, ...] = "features"
     trained_steps: int | None = None
 
     def __post_init__(self):
@@ -67,7 +68,7 @@ class Environment:
             raise ValueError(f"Environment: the driving reward needs the ego path, contract.kinematics is "
                              f"{self.contract.kinematics!r}, and this run trained no head ego_motion. Train it "
                              f"(--with-heads=ego_motion), or pass a reward_function of your own.")
-        if self._tests_collisions:
+        if self._reads_obstacles:
             grid, scale = self.model.config.voxels, self.reward_config.occupancy_scale
             rewards.obstacle_layers(grid.shape[2] // scale, grid, self.reward_config.box, pooled=self.pooled)
 
@@ -111,13 +112,22 @@ class Environment:
     @property
     def decoded_heads(self) -> tuple[str, ...]:
         """What every step decodes."""
-        wanted = () if self.observation == "features" else tuple(self.observation)
         path = ("ego_motion",) if self.ego_path == "ego_motion" else ()
-        return tuple(dict.fromkeys((*wanted, *self._reward_heads, *path)))
+        return tuple(dict.fromkeys((*self._observed_heads, *self._reward_heads, *path)))
+
+    @property
+    def _observed_heads(self) -> tuple[str, ...]:
+        if self.observation == "features":
+            return ()
+        return ("occupancy",) if self.observation == "road" else tuple(self.observation)
 
     @property
     def _tests_collisions(self) -> bool:
         return self.reward_function is None and self.reward_config.collision > 0
+
+    @property
+    def _reads_obstacles(self) -> bool:
+        return self._tests_collisions or self.observation == "road"
 
     @property
     def _reward_heads(self) -> tuple[str, ...]:
@@ -128,12 +138,14 @@ class Environment:
     @property
     def observation_shapes(self) -> Any:
         """jax.ShapeDtypeStruct of an observation: one, or a dict of them by head."""
+        if self.observation == "road":
+            return jax.ShapeDtypeStruct((road.CHANNELS,), jnp.float32)
         config = self.model.config
 
         def example(variables):
             latent = self.model.initial_state(1)
             bank = StartBank(latent, jnp.zeros((1,)), None, memory_lib.empty(config, 1), jnp.zeros((1,), jnp.int32))
-            return self._observe(latent.features[0], self._decode(variables, bank, latent[0], jnp.int32(0))[0])
+            return self._shown(latent.features[0], self._decode(variables, bank, latent[0], jnp.int32(0))[0])
 
         return jax.eval_shape(example, self.model.variable_shapes())
 
@@ -185,7 +197,7 @@ class Environment:
                              f"what was seen of late; make it of what `observe` returned (Environment.starts).")
         routes = None if bank.route_map is None else _follow(jnp.asarray(bank.route_map), self.reward_config.route)
         seen, vantage = None, bank.latent.vantage
-        if self._tests_collisions and bank.memory is not None and bank.row is not None and vantage is not None:
+        if self._reads_obstacles and bank.memory is not None and bank.row is not None and vantage is not None:
             seen = _seen(bank.memory.range_view, bank.row, vantage.last, self.model.config.voxels,
                          self.reward_config.box)
         return EnvParams(jax.tree.map(jnp.asarray, variables), bank, jnp.int32(horizon), jnp.float32(temperature),
@@ -195,15 +207,31 @@ class Environment:
         """Draws a start from the bank: (observation, state)."""
         forks.check("Environment.reset")
         start = jax.random.randint(key, (), 0, params.bank.size, jnp.int32)
-        state = EnvState(params.bank.latent[start], motion_ops.at_rest_of_frame(params.bank.speed_mps[start]),
-                         start, jnp.int32(0), jnp.float32(0), jnp.bool_(False))
+        state = self.state_at(start, params)
         return self.observe(state, params), state
+
+    def state_at(self, start: Array, params: EnvParams) -> EnvState:
+        """The first moment of an episode from `start`, int32 index into the bank."""
+        bank = params.bank
+        return EnvState(bank.latent[start], motion_ops.at_rest_of_frame(bank.speed_mps[start]), start, jnp.int32(0),
+                        jnp.float32(0), jnp.bool_(False))
 
     def observe(self, state: EnvState, params: EnvParams) -> Any:
         """The observation of a state."""
-        wanted = () if self.observation == "features" else tuple(self.observation)
-        decoded, _ = self._decode(params.variables, params.bank, state.latent, state.start, wanted)
-        return self._observe(state.latent.features, decoded)
+        decoded, coarse = self._decode(params.variables, params.bank, state.latent, state.start, self._observed_heads)
+        return self._observe(state, params, decoded, coarse)
+
+    def obstacles(self, state: EnvState, params: EnvParams) -> Array:
+        """Probabilities [X, Y] that something stands in a column of voxels, as decoded of a state, in the car's own
+        frame (rewards.obstacle_plan)."""
+        _, coarse = self._decode(params.variables, params.bank, state.latent, state.start, ("occupancy",))
+        return self._plan(coarse["occupancy"])
+
+    def road(self, state: EnvState, params: EnvParams, obstacles: Array) -> Array:
+        """The observation "road" [road.CHANNELS] of a state with these `obstacles`."""
+        return road.observe(state.motion, route_of(params, state), obstacles, state.motion.pose,
+                            self.seen_ahead(params, state, state.time), grid=self.model.config.voxels,
+                            config=self.reward_config, pooled=self.pooled)
 
     def step(self, key: Array, state: EnvState, action: Array, params: EnvParams) -> tuple[EnvState, Transition]:
         """One imagined step under action [2], clipped to [-1, 1]; see Transition. No auto-reset: `restart` does it."""
@@ -226,7 +254,7 @@ class Environment:
         reward, terminated, terms = self._reward(moment)
         after = EnvState(latent, motion, state.start, state.time + 1, reward, terminated)
         truncated = after.time >= params.max_steps_in_episode
-        return after, Transition(self._observe(latent.features, full), reward, terminated, truncated, terms)
+        return after, Transition(self._observe(after, params, full, for_reward), reward, terminated, truncated, terms)
 
     def restart(self, key: Array, state: EnvState, observation: Any, final: Array,
                 params: EnvParams) -> tuple[EnvState, Any]:
@@ -255,9 +283,12 @@ class Environment:
         """What was seen at the start and counts `after_steps` [*L] steps later: [*L, X, Y]; None without memory."""
         if params.seen is None:
             return None
-        holds = after_steps * self.step_s <= self.reward_config.seen_s + 1e-6
-        return jnp.where(jnp.expand_dims(holds, (-2, -1)), jnp.broadcast_to(
+        return jnp.where(jnp.expand_dims(self.holds_seen(after_steps), (-2, -1)), jnp.broadcast_to(
             params.seen[state.start], (*jnp.shape(after_steps), *params.seen.shape[1:])), 0.0)
+
+    def holds_seen(self, after_steps: Array) -> Array:
+        """Whether what was seen at the start counts so many steps later, bool."""
+        return after_steps * self.step_s <= self.reward_config.seen_s + 1e-6
 
     def _reward(self, moment: rewards.Moment) -> tuple[Array, Array, dict[str, Array]]:
         if self.reward_function is not None:
@@ -277,7 +308,15 @@ class Environment:
         return full, full if "occupancy" not in names else {
             **full, "occupancy": predictions.at_scale(self.reward_config.occupancy_scale).occupancy}
 
-    def _observe(self, features: Array, decoded: dict[str, Array]) -> Any:
+    def _plan(self, occupancy: Array) -> Array:
+        return rewards.obstacle_plan(occupancy, self.model.config.voxels, self.reward_config.box, pooled=self.pooled)
+
+    def _observe(self, state: EnvState, params: EnvParams, decoded: dict[str, Array], coarse: dict[str, Array]) -> Any:
+        if self.observation == "road":
+            return self.road(state, params, self._plan(coarse["occupancy"]))
+        return self._shown(state.latent.features, decoded)
+
+    def _shown(self, features: Array, decoded: dict[str, Array]) -> Any:
         if self.observation == "features":
             return self.model.policy_features(features)
         return {name: decoded[name] for name in self.observation}

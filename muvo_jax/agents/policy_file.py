@@ -2,7 +2,7 @@
 
     policy_file.save(run.folder / policy_file.FOLDER, run, config, learner.actor, {"updates": 400})
     agent = policy_file.load(run.folder / policy_file.FOLDER, run)
-    driver = closed_loop.policy_driver(simulator, run.model, run.variables, agent.policy())
+    driver = closed_loop.policy_driver(simulator, agent.environment(run), run.variables, agent.policy())
 
 A policy reads a latent state whose numbers mean something in one model alone, so agent.json says which one, down to a
 checksum of its weights, and `load` refuses any other.
@@ -25,13 +25,15 @@ from flax import traverse_util
 
 from muvo_jax import run as run_lib
 from muvo_jax import safetensors_file
-from muvo_jax.agents import actor_critic
+from muvo_jax.agents import actor_critic, rewards
+from muvo_jax.agents import environment as environment_lib
 from muvo_jax.config import parsing
 from muvo_jax.types import Variables
 
 FOLDER = "agent"  # of a run, unless another place is named
 WEIGHTS, DESCRIPTION = "actor.safetensors", "agent.json"
 SCHEMA_VERSION = 1
+OBSERVATIONS = ("features", "road")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -42,11 +44,17 @@ class StoredPolicy:
       config: its networks and how they learned.
       actor: its parameters, float32.
       training: what its training says of itself, JSON types.
+      observation: what it observes, "features" or "road" (Environment.observation).
     """
 
     config: actor_critic.ActorCriticConfig
     actor: Any
     training: Mapping[str, Any]
+    observation: str = "features"
+
+    def environment(self, run: run_lib.Run) -> environment_lib.Environment:
+        """The environment whose observations it reads; rewards are not those in which it learned."""
+        return _environment(run, self.observation)
 
     def policy(self, *, sampled: bool = False) -> jax.tree_util.Partial:
         """As actor_critic.policy; the mode of its actions unless sampled."""
@@ -54,7 +62,7 @@ class StoredPolicy:
 
 
 def save(folder: str | os.PathLike, run: run_lib.Run, config: actor_critic.ActorCriticConfig, actor: Any,
-         training: Mapping[str, Any] | None = None) -> pathlib.Path:
+         training: Mapping[str, Any] | None = None, *, observation: str = "features") -> pathlib.Path:
     """Writes an agent; what stood there is replaced, the description last.
 
     Args:
@@ -62,6 +70,7 @@ def save(folder: str | os.PathLike, run: run_lib.Run, config: actor_critic.Actor
       run: in whose imagination it learned.
       config, actor: settings and parameters of the actor (Learner.actor).
       training: what else agent.json should say, JSON types.
+      observation: of the environment in which it learned.
 
     Returns:
       the folder.
@@ -69,8 +78,8 @@ def save(folder: str | os.PathLike, run: run_lib.Run, config: actor_critic.Actor
     folder = pathlib.Path(folder).expanduser()
     folder.mkdir(parents=True, exist_ok=True)
     flat = traverse_util.flatten_dict(jax.device_get(actor), sep="/")
-    described = {"schema_version": SCHEMA_VERSION, "world_model": identity(run), "actor_critic": dataclasses.asdict(
-        config), "training": dict(training or {})}
+    described = {"schema_version": SCHEMA_VERSION, "world_model": identity(run), "observation": observation,
+                 "actor_critic": dataclasses.asdict(config), "training": dict(training or {})}
     partial = folder / f"{DESCRIPTION}.part"
     try:
         partial.write_text(json.dumps(described, indent=1) + "\n", encoding="utf-8")
@@ -96,7 +105,8 @@ def load(folder: str | os.PathLike, run: run_lib.Run) -> StoredPolicy:
     path = folder / DESCRIPTION
     try:
         described = json.loads(path.read_text(encoding="utf-8"))
-        version, learned_in, training = (described[name] for name in ("schema_version", "world_model", "training"))
+        version, learned_in, training, observation = (
+            described[name] for name in ("schema_version", "world_model", "training", "observation"))
     except (ValueError, KeyError, TypeError) as error:
         raise ValueError(f"{path} cannot be read ({type(error).__name__}: {error}); train the agent anew.") from error
     if version != SCHEMA_VERSION:
@@ -105,7 +115,9 @@ def load(folder: str | os.PathLike, run: run_lib.Run) -> StoredPolicy:
     config = parsing.parse(actor_critic.ActorCriticConfig, described.get("actor_critic"), f"{path}: actor_critic")
     actor = traverse_util.unflatten_dict(
         {name: jnp.asarray(value) for name, value in safetensors_file.load(folder / WEIGHTS).items()}, sep="/")
-    stored = StoredPolicy(config, actor, training)
+    if observation not in OBSERVATIONS:
+        raise ValueError(f"{path}: the agent observes {observation!r}, this version knows {', '.join(OBSERVATIONS)}.")
+    stored = StoredPolicy(config, actor, training, observation)
     _check_network(stored, run, folder)
     return stored
 
@@ -138,9 +150,16 @@ def _check_identity(learned_in: Mapping[str, Any], here: Mapping[str, Any], fold
                          f"{'; '.join(different)}. {mend}.")
 
 
+def _environment(run, observation):
+    """Without collisions in its reward, for which models would need a head that the policy does not look at."""
+    return environment_lib.Environment.of_run(run, observation=observation,
+                                              reward_config=rewards.RewardConfig(collision=0.0))
+
+
 def _check_network(stored: StoredPolicy, run: run_lib.Run, folder: pathlib.Path) -> None:
     """Raises ValueError where the parameters are not those of the network that the settings describe."""
-    observation = jax.ShapeDtypeStruct((1, run.model.policy_feature_channels), jnp.float32)
+    shape = stored.environment(run).observation_shapes.shape
+    observation = jax.ShapeDtypeStruct((1, *shape), jnp.float32)
     wrong = [name for name, leaf in traverse_util.flatten_dict(stored.actor, sep="/").items()
              if not np.isfinite(np.asarray(leaf)).all()]
     if wrong:

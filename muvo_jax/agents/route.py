@@ -95,3 +95,28 @@ def place(route: Route, pose: Array) -> tuple[Array, Array]:
     nearest = jnp.argmin(square, axis=-1, keepdims=True)
     pick = lambda value: jnp.take_along_axis(value, nearest, axis=-1)[..., 0]
     return jnp.where(reached.any(axis=-1), pick(along), 0.0), jnp.sqrt(pick(square) + 1e-6)
+
+
+def ahead(route: Route, pose: Array, distances_m: Array) -> Array:
+    """Poses [D, 3] on a route (without leading axes), so many metres on from the place nearest to a car at pose [3].
+
+    Where the line is known no farther, its last known place; without a route the car's own frame's origin.
+    """
+    along, _ = place(route, pose)
+    some = route.known.any()
+    low = jnp.where(some, jnp.where(route.known, route.along_m, jnp.inf).min(), 0.0)
+    high = jnp.where(some, jnp.where(route.known, route.along_m, -jnp.inf).max(), 0.0)
+    spot = (jnp.clip(along + distances_m, low, high) - route.along_m[0]) / (route.along_m[1] - route.along_m[0])
+    first = jnp.clip(jnp.floor(spot), 0, route.along_m.shape[0] - 2).astype(jnp.int32)
+    line = route.points_m[first + 1] - route.points_m[first]
+    # The last known point of the line may be followed by copies of itself: a heading needs two that differ.
+    back = route.points_m[first] - route.points_m[jnp.maximum(first - 1, 0)]
+    towards = jnp.where((line**2).sum(-1, keepdims=True) > 1e-6, line, back)
+    heading = jnp.arctan2(towards[:, 1], jnp.where((towards**2).sum(-1) > 1e-6, towards[:, 0], 1.0))
+    return jnp.concatenate([route.points_m[first] + (spot - first)[:, None] * line, heading[:, None]], axis=-1)
+
+
+def straight() -> Route:
+    """The route of a car without one: straight on along the heading of its start."""
+    along = jnp.arange(-POINTS_BEHIND, POINTS_AHEAD + 1, dtype=jnp.float32)
+    return Route(jnp.stack([along, jnp.zeros_like(along)], axis=-1), along, jnp.ones(along.shape, jnp.bool_))

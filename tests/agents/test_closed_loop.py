@@ -9,6 +9,7 @@ import pytest
 import worlds
 
 from muvo_jax.agents import closed_loop, planners
+from muvo_jax.agents import environment as environment_lib
 
 STEP_S = 0.2
 FAST = planners.PlannerConfig(plans=8, iterations=2, elites=2, kept=1)
@@ -96,6 +97,9 @@ def test_the_planner_stops_before_a_wall_unless_collisions_cost_nothing():
     assert drives[5.0].progress_m > 7.0  # it drove on to where the wall was near
 
 
+WALL_WORLD = environment_lib.Environment(worlds.WALL_MODEL, periods=2, reward_config=worlds.NO_COLLISION)
+
+
 def before_the_wall(wall_m):
     """A road with a wall that worlds.WALL_MODEL sees: all ranges are the distance to it."""
     grid, bare = worlds.CONFIG.range_view, road(wall_m=wall_m)
@@ -115,7 +119,7 @@ def test_a_policy_drives_by_what_the_model_makes_of_the_sensors_and_compiles_onc
 
     world, ends, compiled = before_the_wall(16.0), [], []
     for share in (1 / 3, 1 / 6):
-        driver = closed_loop.policy_driver(world, worlds.WALL_MODEL, {}, jax.tree_util.Partial(wanted, share))
+        driver = closed_loop.policy_driver(world, WALL_WORLD, {}, jax.tree_util.Partial(wanted, share))
         done = run(world, driver, steps=25)
         ends.append(done.moments[-1].state)
         compiled.append(closed_loop._act._cache_size())
@@ -129,7 +133,7 @@ def test_a_policy_drives_by_what_the_model_makes_of_the_sensors_and_compiles_onc
 def test_a_policys_action_that_is_no_number_is_named_with_its_step():
     world = before_the_wall(16.0)
     losing = lambda key, features: jnp.where(features[:, :1] < 12.5, jnp.nan, jnp.zeros((1, 2)))
-    driver = closed_loop.policy_driver(world, worlds.WALL_MODEL, {}, losing)
+    driver = closed_loop.policy_driver(world, WALL_WORLD, {}, losing)
     with pytest.raises(ValueError, match=r"seed 0, at step 4 .* the driver chose \[nan, nan\]"):
         run(world, driver)
 

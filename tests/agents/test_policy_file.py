@@ -11,7 +11,7 @@ from worlds import MODEL, variables
 
 from muvo_jax import presets, safetensors_file
 from muvo_jax import run as run_lib
-from muvo_jax.agents import actor_critic, policy_file
+from muvo_jax.agents import actor_critic, policy_file, road
 
 SETTINGS = actor_critic.ActorCriticConfig(width=8, layers=1, horizon=5)
 RUN = run_lib.Run(MODEL, variables(), presets.get("tiny"), step=7)
@@ -32,6 +32,18 @@ def test_an_agent_comes_back_as_it_was(actor, tmp_path):
     actions = agent.policy()(jax.random.key(0), seen)
     np.testing.assert_array_equal(actions, actor_critic.policy(SETTINGS, actor, sampled=False)(jax.random.key(0), seen))
     assert actions.shape == (2, 2) and np.abs(actions[0] - actions[1]).max() > 0
+    assert agent.environment(RUN).observation == "features"
+
+
+def test_an_agent_that_saw_the_road_gets_the_road(tmp_path):
+    shapes = actor_critic._actor(SETTINGS).init(jax.random.key(0), jnp.zeros(road.CHANNELS))
+    policy_file.save(tmp_path, RUN, SETTINGS, shapes, observation="road")
+    assert policy_file.load(tmp_path, RUN).environment(RUN).observation_shapes.shape == (road.CHANNELS,)
+    described = json.loads((tmp_path / "agent.json").read_text())
+    for observation, message in (("features", "does not fit the settings"), ("smell", "observes 'smell', this")):
+        (tmp_path / "agent.json").write_text(json.dumps(described | {"observation": observation}))
+        with pytest.raises(ValueError, match=message):
+            policy_file.load(tmp_path, RUN)
 
 
 @pytest.mark.parametrize(("change", "message"), [

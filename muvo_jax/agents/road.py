@@ -1,0 +1,63 @@
+"""What a driving policy sees of the road: its speed, the route ahead, and what stands on it as far as the model says.
+
+The observation "road" of an Environment. A pooled latent does not say where the car is in its lane (a linear read-out
+explains 4 % of the lateral offset's variance, docs/agents.md), and where something stands it says no better: pooling
+averages over places. A car knows its speed and its route map anyway, and what stands where, decoders say.
+"""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from muvo_jax import config as config_lib
+from muvo_jax.agents import rewards
+from muvo_jax.agents import route as route_lib
+from muvo_jax.ops import motion as motion_ops
+from muvo_jax.types import Array, Motion
+
+ROUTE_AHEAD_M = np.array([0.0, 2.0, 4.0, 7.0, 10.0, 14.0, 18.0], np.float32)  # where the route is looked at
+CLEARANCE_M = np.array([0.0, 1.0, 2.0, 3.0, 4.0, 6.0, 8.0, 10.0, 13.0, 16.0, 20.0], np.float32)  # the car put there
+STRAIGHT_M = np.array([0.0, 2.0, 4.0], np.float32)  # the car put straight ahead of itself
+CHANNELS = 1 + 3 * ROUTE_AHEAD_M.size + CLEARANCE_M.size + STRAIGHT_M.size
+SPEED_UNIT_MPS = 10.0
+NEAREST_UNIT_M = 2.0  # places on the route come divided by their distance, the nearest ones by this
+TURN_UNIT_RAD = 0.5
+PROBABILITY_UNIT = 0.5
+
+
+def observe(motion: Motion, route: route_lib.Route | None, obstacles: Array, obstacles_pose: Array, seen: Array | None,
+            *, grid: config_lib.VoxelGrid, config: rewards.RewardConfig, pooled: bool = True) -> Array:
+    """The observation of one car: float32 [CHANNELS], each number about 1 where it is large.
+
+    Speed; forward, left and turn of the route ahead in the car's frame; the probability that the car would touch
+    something if it stood at places of the route and straight ahead. Differentiable in the motion, but for these
+    probabilities, whose slopes are nothing or cliffs.
+
+    Args:
+      motion: Motion [], in the frame of the start.
+      route: the line on the start's route map; None counts as straight on along the start's heading.
+      obstacles: [X, Y] of rewards.obstacle_plan, in the frame of a car at `obstacles_pose` [3].
+      seen: [X, Y] of rewards.seen_plan in the frame of the start, or None.
+      grid, config, pooled: of the model and the reward; see rewards.box_collision.
+    """
+    route = route_lib.straight() if route is None else route
+    ahead = motion_ops.relative(route_lib.ahead(route, motion.pose, ROUTE_AHEAD_M), motion.pose)
+    unit_m = jnp.asarray(np.maximum(ROUTE_AHEAD_M, NEAREST_UNIT_M))[:, None]
+    turn = jnp.arctan2(jnp.sin(ahead[:, 2]), jnp.cos(ahead[:, 2])) / TURN_UNIT_RAD
+    straight = jnp.stack([jnp.asarray(STRAIGHT_M), *2 * [jnp.zeros(STRAIGHT_M.size, jnp.float32)]], axis=-1)
+    places = jnp.concatenate([route_lib.ahead(route, motion.pose, CLEARANCE_M), _from(motion.pose, straight)])
+    blocked = rewards.box_collision(obstacles, motion_ops.relative(places, obstacles_pose[None]), grid, config.box,
+                                    pooled=pooled)
+    if seen is not None:
+        blocked = jnp.maximum(blocked, rewards.box_collision(seen, places, grid, config.box))
+    return jnp.concatenate([motion.speed_mps[None] / SPEED_UNIT_MPS, (ahead[:, :2] / unit_m).reshape(-1), turn,
+                            jax.lax.stop_gradient(blocked) / PROBABILITY_UNIT])
+
+
+def _from(pose: Array, relative: Array) -> Array:
+    """Poses [N, 3] that a car at `pose` [3] calls `relative` [N, 3]: motion_ops.relative backwards."""
+    cosine, sine = jnp.cos(pose[2]), jnp.sin(pose[2])
+    return jnp.stack([pose[0] + cosine * relative[:, 0] - sine * relative[:, 1],
+                      pose[1] + sine * relative[:, 0] + cosine * relative[:, 1], pose[2] + relative[:, 2]], axis=-1)

@@ -1,0 +1,134 @@
+"""Futures imagined once and driven many times, the observation "road", and learning in them, before a made-up wall."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import worlds
+
+from muvo_jax.agents import actor_critic, ranking, road
+from muvo_jax.agents import environment as environment_lib
+from muvo_jax.agents import futures as futures_lib
+from muvo_jax.agents import route as route_lib
+from muvo_jax.agents.closed_loop import Drive, Moment, Situation
+from muvo_jax.types import Motion
+
+HORIZON = 10
+
+
+@pytest.fixture(scope="module")
+def imagined():
+    """(environment, policy, futures): two cars that go on at 6 m/s, 16 m before a wall."""
+    world, params = worlds.before_a_wall(16.0, 6.0, HORIZON, speed_limit_mps=8.0)
+    world = dataclasses.replace(world, observation="road")
+    params = world.params({}, params.bank, HORIZON)
+    policy = jax.tree_util.Partial(coast)
+    starts = jnp.zeros(2, jnp.int32)
+    return world, policy, futures_lib.imagine(world, params, jax.random.key(0), starts, policy, HORIZON)
+
+
+def coast(key, observation):
+    assert observation.shape == (road.CHANNELS,)
+    return jnp.zeros(2)
+
+
+@pytest.fixture(scope="module")
+def driven(imagined):
+    """(speeds, actions) -> (rewards' sum, (observations, rewards, ends)) and the sum's slope in the actions; compiled
+    once."""
+    world, _, futures = imagined
+
+    def drive(actions, speed_mps):
+        start = Motion(jnp.zeros((2, 3)), speed_mps)
+        seen, reward, terminated, _ = futures_lib.drive(world, futures, start, lambda seen, step: (actions[step], ()))
+        return reward.sum(), (seen, reward, terminated)
+
+    return jax.jit(jax.value_and_grad(drive, has_aux=True))
+
+
+def test_the_first_drive_is_that_of_the_environment(imagined, driven):
+    futures = imagined[-1]
+    (_, (seen, reward, terminated)), _ = driven(jnp.zeros((HORIZON, 2, 2), jnp.float32), futures.speed_mps)
+    # the wall rises by 20 a metre inside the sigmoid and costs 20: 1e-7 of its 16 m are some 1e-4 of reward
+    np.testing.assert_allclose(reward.T, futures.reward, atol=2e-4)
+    np.testing.assert_array_equal(terminated.T, futures.terminated)
+    assert futures.terminated.any(), "at 6 m/s the wall is reached within 2 s"
+    np.testing.assert_allclose(seen[:, :, 0], 0.6, rtol=1e-6)  # speed / 10 m/s
+
+
+def test_a_future_has_a_derivative_in_the_actions(driven):
+    """At 2 m/s nothing is near in 2 s: accelerating earns more, sooner most, steering off the route less."""
+    _, slope = driven(jnp.full((HORIZON, 2, 2), 0.01, jnp.float32), jnp.full((2,), 2.0, jnp.float32))
+    assert (np.diff(slope[:, 0, 0]) < 0).all() and slope[0, 0, 0] > 0.1
+    assert slope[0, 0, 1] < 0
+
+
+def test_a_clearance_says_how_far_the_wall_is(imagined):
+    """After five steps it is 10 m from the car's origin, and the car's front 3.7 m before that."""
+    world, _, futures = imagined
+    at = jax.tree.map(lambda leaf: leaf[0, 5], (futures.obstacles, futures.pose))
+    look = jax.jit(lambda motion, obstacles, pose: road.observe(
+        motion, None, obstacles, pose, None, grid=world.model.config.voxels, config=world.reward_config))(
+            Motion(at[1], jnp.float32(6.0)), *at)
+    first = 1 + 3 * road.ROUTE_AHEAD_M.size
+    blocked = look[first:first + road.CLEARANCE_M.size] * road.PROBABILITY_UNIT
+    near = road.CLEARANCE_M <= 10.0  # farther on the grid ends
+    front_m = road.CLEARANCE_M + world.reward_config.box.front_m - 0.5  # to a quarter of a voxel, of 2 m
+    np.testing.assert_array_equal(blocked[near] > 0.5, front_m[near] > 10.0)
+    ahead = look[1:first - road.ROUTE_AHEAD_M.size].reshape(-1, 2)
+    np.testing.assert_allclose(ahead, [[0, 0], *[[1, 0]] * 6], atol=1e-5)
+
+
+def test_it_learns_to_stop_before_the_wall(imagined):
+    world, _, futures = imagined
+    config = actor_critic.ActorCriticConfig(width=16, layers=1, learning_rate=1e-2, clip_norm=1.0)
+    learner = actor_critic.init(jax.random.key(0), world, config)
+    many = futures[jnp.zeros(8, jnp.int32)]
+    returns = []
+    for key in jax.random.split(jax.random.key(1), 30):
+        learner, metrics = actor_critic.improve(world, config, many, key, learner)
+        returns.append(float(metrics["reward"]))
+    assert np.mean(returns[-5:]) > np.mean(returns[:3]) + 1.0, "crashing costs 20"
+    act = lambda seen, step: (jax.vmap(actor_critic.policy(config, learner.actor, sampled=False), (None, 0))(
+        jax.random.key(0), seen), ())
+    ended = futures_lib.drive(world, many, Motion(jnp.zeros((8, 3)), many.speed_mps), act)[2]
+    assert not ended.any()
+
+
+def test_what_cannot_be_shared_is_refused(imagined):
+    world, policy, _ = imagined
+    features = dataclasses.replace(world, observation="features")
+    with pytest.raises(ValueError, match=r"the observation 'features' .* expected Environment\(observation=\"road\""):
+        futures_lib.imagine(features, None, jax.random.key(0), jnp.zeros(1, jnp.int32), policy, 2)
+    heads = environment_lib.Environment(worlds.WALL_MODEL, periods=2, observation=("occupancy",))
+    with pytest.raises(ValueError, match="observes the heads occupancy; expected one vector"):
+        actor_critic.init(jax.random.key(0), heads, actor_critic.ActorCriticConfig())
+
+
+def test_places_ahead_lie_on_the_route_and_end_with_it():
+    along = jnp.arange(-2.0, 9.0)
+    bend = jnp.stack([jnp.minimum(along, 4.0), jnp.maximum(along - 4.0, 0.0)], axis=-1)  # left after 4 m
+    route = route_lib.Route(bend, along, along < 7.5)
+    ahead = jax.jit(route_lib.ahead)
+    poses = ahead(route, jnp.array([1.0, -0.5, 0.0]), jnp.array([0.0, 2.5, 5.0, 99.0]))
+    np.testing.assert_allclose(poses, [[1, 0, 0], [3.5, 0, 0], [4, 2, np.pi / 2], [4, 3, np.pi / 2]], atol=1e-5)
+    nowhere = dataclasses.replace(route, known=jnp.zeros(11, bool))
+    assert np.isfinite(ahead(nowhere, jnp.zeros(3), jnp.array([0.0, 5.0, 9.0, 99.0]))).all()
+
+
+def test_rewards_of_a_real_drive_by_hand():
+    """Two steps of 0.2 s, limit 8 m/s: 1.6 m on earn 1; then a collision at 10 m/s, 2 m on, coasting."""
+    world, _ = worlds.before_a_wall(16.0, 6.0, 2, speed_limit_mps=8.0)
+    places = (Situation(3.0, speed_mps=8.0), Situation(4.6, speed_mps=8.0), Situation(6.6, True, speed_mps=10.0))
+    moments = tuple(Moment(None, np.array(action, np.float32), None) for action in ((-0.5, 0.0), (0.0, 0.0)))
+    # braking with half of 6 m/s2 costs 0.05; 2 / 1.6 m divided by 10 / 8 earn 1, speeding costs 1/4
+    want = [1.0 - 0.05, 1.0 - 0.25 - 20.0]
+    np.testing.assert_allclose(ranking.town_rewards(world, Drive(3.6, 2, places, moments)), want, rtol=1e-6)
+
+
+def test_spearman_by_hand():
+    assert ranking.spearman([1, 2, 3, 9], [10, 20, 25, 26]) == pytest.approx(1.0)
+    assert ranking.spearman([1, 2, 3], [3, 1, 2]) == pytest.approx(-0.5)  # 1 - 6 (4 + 1 + 1) / (3 * 8)
+    assert np.isnan(ranking.spearman([1, 1], [1, 2]))

@@ -98,8 +98,8 @@ class PolicyMemory:
     """
 
     live: live.LiveState
-    speed_mps: Array
-    route_map: Array | None
+    speed_mps: ArrayLike
+    route_map: ArrayLike | None
 
 
 @dataclasses.dataclass(frozen=True)

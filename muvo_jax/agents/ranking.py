@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+import jax.numpy as jnp
 import numpy as np
 
 from muvo_jax.agents import closed_loop
@@ -20,7 +21,7 @@ def town_rewards(environment: environment_lib.Environment, drive: closed_loop.Dr
     config, contract = environment.reward_config, environment.contract
     speed_mps = np.array([situation.speed_mps for situation in drive.situations[1:]])
     progress_m = np.diff([situation.progress_m for situation in drive.situations])
-    action = np.stack([moment.action for moment in drive.moments])
+    action = jnp.stack([jnp.asarray(moment.action) for moment in drive.moments])
     along = np.asarray(motion_ops.acceleration_mps2(action, contract))
     across = speed_mps**2 * np.asarray(motion_ops.curvature_per_m(action, contract))
     gained = progress_m / (config.speed_limit_mps * environment.step_s)

@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 
 from muvo_jax.config import RouteMap
-from muvo_jax.types import Array
+from muvo_jax.types import Array, ArrayLike
 
 PAINTED = 127  # a route map's pixels above this lie on the route
 POINTS_AHEAD, POINTS_BEHIND = 64, 24
@@ -97,7 +97,7 @@ def place(route: Route, pose: Array) -> tuple[Array, Array]:
     return jnp.where(reached.any(axis=-1), pick(along), 0.0), jnp.sqrt(pick(square) + 1e-6)
 
 
-def ahead(route: Route, pose: Array, distances_m: Array) -> Array:
+def ahead(route: Route, pose: Array, distances_m: ArrayLike) -> Array:
     """Poses [D, 3] on a route (without leading axes), so many metres on from the place nearest to a car at pose [3].
 
     Where the line is known no farther, its last known place; without a route the car's own frame's origin.
@@ -106,7 +106,8 @@ def ahead(route: Route, pose: Array, distances_m: Array) -> Array:
     some = route.known.any()
     low = jnp.where(some, jnp.where(route.known, route.along_m, jnp.inf).min(), 0.0)
     high = jnp.where(some, jnp.where(route.known, route.along_m, -jnp.inf).max(), 0.0)
-    spot = (jnp.clip(along + distances_m, low, high) - route.along_m[0]) / (route.along_m[1] - route.along_m[0])
+    spacing = route.along_m[1] - route.along_m[0]
+    spot = (jnp.clip(along + jnp.asarray(distances_m), low, high) - route.along_m[0]) / spacing
     first = jnp.clip(jnp.floor(spot), 0, route.along_m.shape[0] - 2).astype(jnp.int32)
     line = route.points_m[first + 1] - route.points_m[first]
     # The last known point of the line may be followed by copies of itself: a heading needs two that differ.

@@ -16,6 +16,7 @@ with late.imports():
 
     from muvo_jax import config as config_lib
     from muvo_jax import evaluation_report
+    from muvo_jax.agents import forecasts
     from muvo_jax.data import fitting, pipeline
     from muvo_jax.metrics import protocol
     from muvo_jax.model import world_model
@@ -54,11 +55,14 @@ class Options:
     """Points of each frame that the Chamfer distance looks at; 0 for all."""
     sampled: Annotated[bool | None, command_line.shown("{True,False}", "the run's")] = None
     """Draw the latents instead of taking their means."""
+    uncertainty: int = 0
+    """Also sample so many futures of each window, and measure how far they can be trusted (RUN/uncertainty.png)."""
 
 
 EXAMPLES = """
 python -m muvo_jax.evaluate runs/town-tr
 python -m muvo_jax.evaluate runs/town-tr --splits val_ds --windows=0  (all windows)
+python -m muvo_jax.evaluate runs/town-tr --splits val_rl --windows=16 --uncertainty=8
 python -m muvo_jax.evaluate runs/town-tr --context=8 --horizon=10 --checkpoint=best
 """
 
@@ -69,6 +73,8 @@ def evaluate(options: Options, show: screen.Screen) -> dict[str, Any]:
     fields = {"data": "data.path", "context": "data.context", "horizon": "data.horizon",
               "windows": "evaluation.windows", "batch": "evaluation.batch",
               "chamfer_points": "evaluation.chamfer_points", "sampled": "evaluation.sampled"}
+    if options.uncertainty < 0 or options.uncertainty == 1:
+        raise ValueError(f"--uncertainty is {options.uncertainty}; expected two futures or more, or 0 for none.")
     chosen = command_line.chosen_settings(options, fields)
     config = config_lib.override_all(loaded.config, chosen)
     recording = command_line.open_data(config, show)
@@ -88,12 +94,22 @@ def evaluate(options: Options, show: screen.Screen) -> dict[str, Any]:
             count = min(count or TRAINING_WINDOWS, TRAINING_WINDOWS)
         scores = protocol.evaluate(world_model.WorldModel(config.model), loaded.variables,
                                    validation.windows(frames, split, count), config, mean)
+        if options.uncertainty:
+            scores["uncertainty"] = forecasts.measure(
+                world_model.WorldModel(config.model), loaded.variables, jax.random.key(config.evaluation.seed),
+                ((entry.batch, len(entry.drives)) for entry in validation.windows(frames, split, count)),
+                context=config.data.context, horizon=config.data.horizon, branches=options.uncertainty)
+            for line in evaluation_report.uncertainty_table(scores["uncertainty"]):
+                show.line(line)
         report["splits"][split] = scores
         for phase in protocol.PHASES:
             show.console.print(evaluation_report.screen_table(split, phase, scores))
         show.line(evaluation_report.answers_line(scores["action_shuffle"]))
     suffix = f"-{recording.description.name}" if options.data else ""
-    for path in evaluation_report.write_report(loaded.folder, report, suffix):
+    written = evaluation_report.write_report(loaded.folder, report, suffix)
+    if options.uncertainty:
+        written += (evaluation_report.draw_uncertainty(loaded.folder / f"uncertainty{suffix}.png", report),)
+    for path in written:
         show.line(f"wrote {path}")
     return report
 

@@ -12,6 +12,7 @@ import numpy as np
 import rich.table
 
 from muvo_jax import head as head_lib
+from muvo_jax.agents import forecasts
 from muvo_jax.data import words
 from muvo_jax.metrics import occupancy, protocol
 
@@ -128,6 +129,8 @@ def markdown(report: Mapping[str, Any]) -> str:
                   "### answer to actions", "", *_answer_table(scores["action_shuffle"]), "",
                   f"Movers: {scores['movers'] or 'none'}. Copy-last copied {scores['copy_last_unknown_voxels']} "
                   f"unknown voxels as empty.", ""]
+        if "uncertainty" in scores:
+            lines += ["### sampled futures", "", *uncertainty_table(scores["uncertainty"]), ""]
     return "\n".join(lines)
 
 
@@ -171,3 +174,43 @@ def _answer_table(ratios: Mapping[str, Any]) -> list[str]:
         cells = [mean, *(number(value, 2) for value in ratio["per_step"])]
         lines.append(f"| {_error_name(head)} | " + " | ".join(cells) + " |")
     return lines
+
+
+def uncertainty_table(found: Mapping[str, Any]) -> list[str]:
+    """What forecasts.measure returns, as Markdown."""
+    steps = len(found["per_step"]["trust"])
+    lines = [f"{words.counted(found['branches'], 'future')} of each of {words.counted(found['windows'], 'window')}. "
+             f"Trust: 1 - variance among the futures of a window / variance of all; at least a half for "
+             f"{words.counted(found['trust_horizon'], 'step')}. CRPS equals the error of one future where all agree.",
+             "",
+             "| score | " + " | ".join(str(step + 1) for step in range(steps)) + " |", "|---|" + "---:|" * steps]
+    for name, values in found["per_step"].items():
+        label, unit, decimals = forecasts.SCORES[name]
+        cells = " | ".join(number(value, decimals) for value in values)
+        lines.append(f"| {label} ({unit}) | {cells} |" if unit else f"| {label} | {cells} |")
+    if "reliability" in found:
+        curve = found["reliability"]
+        row = lambda label, values: f"| {label} | " + " | ".join(number(value, 2) for value in values) + " |"
+        lines += ["", row("probability of a voxel above the road", curve["confidence"]),
+                  "|---|" + "---:|" * len(curve["confidence"]),
+                  row("how often it was occupied", curve["frequency"]), "",
+                  f"Expected calibration error {number(curve['calibration_error'], 4)}."]
+    return lines
+
+
+def draw_uncertainty(path: pathlib.Path, report: Mapping[str, Any]) -> pathlib.Path:
+    """A page with the reliability curves of all splits and their trust over the horizon."""
+    from muvo_jax.viz import curves  # with Pillow, which judging does not need
+
+    found = {split: scores["uncertainty"] for split, scores in report["splits"].items()}
+    steps = {split: (range(1, 1 + len(one["per_step"]["trust"])), one["per_step"]["trust"])
+             for split, one in found.items()}
+    plots = [curves.curve(steps, "trust over the steps")]
+    points = lambda curve: [point for point in zip(curve["confidence"], curve["frequency"], strict=True)
+                            if not math.isnan(point[0])]
+    reliable: dict[str, curves.Series] = {
+        split: tuple(zip(*points(one["reliability"]), strict=True))  # type: ignore[misc]
+        for split, one in found.items() if "reliability" in one and points(one["reliability"])}
+    if reliable:
+        plots.append(curves.curve({"exact": ((0.0, 1.0), (0.0, 1.0)), **reliable}, "how often voxels were occupied"))
+    return curves.write_curves(path, plots, f"{pathlib.Path(report['run']).name}: sampled futures")

@@ -189,8 +189,8 @@ class Environment:
         if self.trained_steps is not None and horizon > self.trained_steps and not isinstance(
                 bank.speed_mps, jax.core.Tracer):
             warnings.warn(f"Environment.params: an episode of {horizon} steps is longer than the {self.trained_steps} "
-                          f"that training imagined; agents.uncertainty.trust_horizon measures how many steps of this "
-                          f"model follow from the start.", stacklevel=2)
+                          f"that training imagined. How far this model can be trusted, python -m muvo_jax.evaluate "
+                          f"RUN --uncertainty=8 measures.", stacklevel=2)
         guessed = memory_lib.guessed_heads(self.model.config)
         if not set(guessed).isdisjoint(self.decoded_heads) and (bank.memory is None or bank.row is None):
             raise ValueError(f"StartBank: it has no memory, but the heads {', '.join(guessed)} of this model look at "

@@ -20,7 +20,7 @@ with late.imports():
 
     from muvo_jax import evaluation_report, town_drive
     from muvo_jax import run as run_lib
-    from muvo_jax.agents import actor_critic, closed_loop, environment, policy_file, ranking, rewards
+    from muvo_jax.agents import actor_critic, closed_loop, environment, policy_file, real_rewards, rewards
     from muvo_jax.agents import futures as futures_lib
     from muvo_jax.data import words
     from muvo_jax.model import rollout
@@ -180,7 +180,7 @@ def town_judge(world: environment.Environment, loaded: run_lib.Run, options: Opt
         driver = closed_loop.policy_driver(driven, world, loaded.variables, policy)
         drives = [closed_loop.drive(driven, driver, jax.random.key(seed), seed, steps, context=context)
                   for seed in range(TUNING_SEED, TUNING_SEED + options.judge_drives)]
-        earned = [ranking.town_rewards(world, one) for one in drives]
+        earned = [real_rewards.town_rewards(world, one) for one in drives]
         return {"town_reward": float(np.concatenate(earned).mean()),
                 "town_progress_m": sum(one.progress_m for one in drives) / sum(one.steps for one in drives),
                 "town_success": float(np.mean([one.unharmed for one in drives]))}

@@ -14,10 +14,11 @@ import pathlib
 import jax
 import jax.numpy as jnp
 import numpy as np
+from scipy import stats
 
 import muvo_jax
 from muvo_jax import town_drive
-from muvo_jax.agents import actor_critic, closed_loop, environment, futures, policy_file, ranking, rewards
+from muvo_jax.agents import actor_critic, closed_loop, environment, futures, policy_file, real_rewards, rewards
 from muvo_jax.town import settings, simulator
 
 HORIZON, HORIZONS, FIRST_SEED = 12, (3, 6, 9, 12), 8_000
@@ -81,7 +82,7 @@ def main():
                 (held.live.latent, held.live.memory, held.speed_mps, held.route_map) for held in memories])
             bank = environment.StartBank(latent, speed_mps, route_map, memory, jnp.arange(options.seeds))
             params = world.params(run.variables, bank, HORIZON, temperature=0.0)
-        earned = [ranking.town_rewards(world, drive) for drive in drives]
+        earned = [real_rewards.town_rewards(world, drive) for drive in drives]
         real[name] = np.mean([np.cumsum(np.pad(one, (0, HORIZON - one.size))) for one in earned], axis=0)
         found = futures.imagine(world, params, jax.random.key(0), jnp.arange(options.seeds), policy, HORIZON)
         imagined[name] = cumulative(np.asarray(found.reward), np.asarray(found.terminated)).mean(axis=0)
@@ -99,7 +100,7 @@ def page(real, imagined, options, step_s):
              "| steps | Spearman | bias of the return | of a step |", "|---:|---:|---:|---:|"]
     for steps in HORIZONS:
         town, dream = (np.array([found[name][steps - 1] for name in names]) for found in (real, imagined))
-        lines.append(f"| {steps} | {ranking.spearman(town, dream):.2f} | {(dream - town).mean():+.2f} | "
+        lines.append(f"| {steps} | {stats.spearmanr(town, dream).statistic:.2f} | {(dream - town).mean():+.2f} | "
                      f"{(dream - town).mean() / steps:+.3f} |")
     lines += ["", "| policy | town | imagined |", "|---|---:|---:|"]
     lines += [f"| {name} | {real[name][-1]:.2f} | {imagined[name][-1]:.2f} |" for name in names]

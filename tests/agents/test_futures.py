@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import worlds
 
-from muvo_jax.agents import actor_critic, ranking, road
+from muvo_jax.agents import actor_critic, real_rewards, road
 from muvo_jax.agents import environment as environment_lib
 from muvo_jax.agents import futures as futures_lib
 from muvo_jax.agents import route as route_lib
@@ -125,10 +125,4 @@ def test_rewards_of_a_real_drive_by_hand():
     moments = tuple(Moment(None, np.array(action, np.float32), None) for action in ((-0.5, 0.0), (0.0, 0.0)))
     # braking with half of 6 m/s2 costs 0.05; 2 / 1.6 m divided by 10 / 8 earn 1, speeding costs 1/4
     want = [1.0 - 0.05, 1.0 - 0.25 - 20.0]
-    np.testing.assert_allclose(ranking.town_rewards(world, Drive(3.6, 2, places, moments)), want, rtol=1e-6)
-
-
-def test_spearman_by_hand():
-    assert ranking.spearman([1, 2, 3, 9], [10, 20, 25, 26]) == pytest.approx(1.0)
-    assert ranking.spearman([1, 2, 3], [3, 1, 2]) == pytest.approx(-0.5)  # 1 - 6 (4 + 1 + 1) / (3 * 8)
-    assert np.isnan(ranking.spearman([1, 1], [1, 2]))
+    np.testing.assert_allclose(real_rewards.town_rewards(world, Drive(3.6, 2, places, moments)), want, rtol=1e-6)

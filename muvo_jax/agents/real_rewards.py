@@ -1,8 +1,6 @@
-"""Whether imagination ranks policies as the world does: what a drive earned, and how two lists of returns agree."""
+"""What the driving reward gives for a real drive, to stand beside what imagination says of it."""
 
 from __future__ import annotations
-
-from collections.abc import Sequence
 
 import jax.numpy as jnp
 import numpy as np
@@ -30,15 +28,3 @@ def town_rewards(environment: environment_lib.Environment, drive: closed_loop.Dr
     collided = np.array([situation.collided for situation in drive.situations[1:]], np.float64)
     return (config.progress * gained - config.comfort * (along**2 + across**2) / config.comfortable_mps2**2
             - config.speeding * speeding - config.collision * collided)
-
-
-def spearman(first: Sequence[float], second: Sequence[float]) -> float:
-    """Rank correlation of two lists; ties share their mean rank; nan where one of them is constant."""
-    def ranks(values):
-        values = np.asarray(values, np.float64)
-        return np.array([(values < value).sum() + 0.5 * ((values == value).sum() - 1) for value in values])
-
-    one, other = ranks(first), ranks(second)
-    one, other = one - one.mean(), other - other.mean()
-    size = np.sqrt((one**2).sum() * (other**2).sum())
-    return float((one * other).sum() / size) if size > 0 else float("nan")

@@ -17,9 +17,9 @@ def main(folder: str, out: str = "", updates: str = "20") -> None:
     batch = muvo_jax.windows(run, "train", count=8)
     observed = muvo_jax.observe(run.model, run.variables, jax.random.key(0), batch)
     world = muvo_jax.Environment.of_run(run)
-    params = world.params(run.variables, world.starts(observed, batch, skip=1), horizon=15)
+    params = world.params(run.variables, world.starts(observed, batch, skip=1), horizon=6)
 
-    settings = actor_critic.ActorCriticConfig(starts=64, horizon=15)
+    settings = actor_critic.ActorCriticConfig(starts=64, horizon=6)
     learner = actor_critic.init(jax.random.key(1), world, settings)
     for update in range(int(updates)):
         learner, metrics = actor_critic.update(world, settings, params, jax.random.key(2 + update), learner)

@@ -51,7 +51,7 @@ def test_readme(folder):
 
 def test_agents():
     names = run("docs/agents.md")
-    assert names["transition"].reward.shape == () and names["transitions"].reward.shape == (15,)
+    assert names["transition"].reward.shape == () and names["transitions"].reward.shape == (6,)
     assert all(np.isfinite(value).all() for value in (names["transition"].reward, names["transitions"].reward,
                                                       names["metrics"]["actor_loss"]))
 

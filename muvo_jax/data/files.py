@@ -26,6 +26,7 @@ BAD_POINT_SHARE = 0.01  # more non-finite points than this are a broken file, no
 DEPTH_UNIT_M, DEPTH_SKY = 0.01, 65535  # of pictures of depth
 PICTURE_FORMATS = ("PNG", "JPEG")  # as Pillow names them
 PICTURE_MODES = ("RGB", "RGBA", "L", "classes", "depth_m")
+_HEADER_TRIES = 8
 _NOT_FRAMES = ("Thumbs.db", "desktop.ini", "rule.json")  # the last one is voxelizing.RULE_FILE
 # Pillow raises any of these for broken chunks and for sizes that would fill the memory.
 _IMAGE_ERRORS = (OSError, SyntaxError, ValueError, TypeError, IndexError, OverflowError, MemoryError, zlib.error,
@@ -155,7 +156,7 @@ def read_npz(path: pathlib.Path, name: str) -> np.ndarray:
             arrays = np.load(file, allow_pickle=False)
             if name not in arrays:
                 raise schema.DataError(f"{path}: holds {', '.join(arrays) or 'nothing'}, expected an array {name!r}.")
-            return arrays[name]
+            return _one_of(arrays, name)
     except FileNotFoundError as error:
         raise missing(path, f"an NPZ file with {name!r}") from error
     except schema.DataError:
@@ -163,6 +164,15 @@ def read_npz(path: pathlib.Path, name: str) -> np.ndarray:
     except _ARCHIVE_ERRORS as error:
         raise schema.DataError(f"{path}: not a readable NPZ file ({error}). The file is truncated or damaged: copy it "
                                f"again, or delete it so that the sequence is split there.") from error
+
+
+def _one_of(arrays: Mapping[str, np.ndarray], name: str) -> np.ndarray:
+    """The array; read again where CPython, parsing the headers of two threads at once, loses count of its recursion
+    (SystemError "AST constructor recursion depth mismatch", seen with 3.11.7)."""
+    for _ in range(_HEADER_TRIES - 1):
+        with contextlib.suppress(SystemError):
+            return arrays[name]
+    return arrays[name]
 
 
 def npz_holds(path: pathlib.Path, name: str) -> bool:

@@ -172,8 +172,8 @@ def test_episodes_longer_than_training_imagined_are_warned_of():
     environment = environment_lib.Environment.of_run(run, reward_config=NO_COLLISION)
     steps = run.config.imagined_steps
     assert environment.trained_steps == steps == 2
-    with pytest.warns(UserWarning, match=r"an episode of 3 steps is longer than the 2 that training imagined;.*"
-                                         r"uncertainty\.trust_horizon"):
+    with pytest.warns(UserWarning, match=r"an episode of 3 steps is longer than the 2 that training imagined\..*"
+                                         r"evaluate RUN --uncertainty"):
         environment.params(variables(), bank(), steps + 1)
     with warnings.catch_warnings():
         warnings.simplefilter("error")

@@ -18,6 +18,8 @@ class _OneSplit:
         self.description = dataclasses.replace(recording.description, splits=(split,))
         self.sequences = tuple(sequence for sequence in recording.sequences if sequence.split == split)
         self.read, self.action = recording.read, recording.action
+        if isinstance(recording, schema.ReadsFields):
+            self.read_fields = recording.read_fields
 
 
 def open_configured(config: config_lib.Config, progress: record.Progress | None = None, *,

@@ -302,15 +302,23 @@ def weighed(moment: Moment, touched: Array | None, *, contract: config_lib.Actio
     """
     terms = {"progress_m": progress_m(moment, config), "discomfort": discomfort(moment, contract, step_s, config),
              "speeding": speeding(moment, config)}
+    if touched is not None:
+        terms["collision"] = touched
+    reward = total(terms, moment.after.speed_mps, step_s=step_s, config=config)
+    ends = jnp.zeros(reward.shape, jnp.bool_) if touched is None else touched > config.terminal_collision
+    return reward, ends, terms
+
+
+def total(terms: Mapping[str, Array], speed_mps: Array, *, step_s: float, config: RewardConfig) -> Array:
+    """The driving reward [...] of its terms, as `weighed` says; without the term "collision" nothing is touched."""
     gained = terms["progress_m"] / (config.speed_limit_mps * step_s)
-    fast = jnp.maximum(moment.after.speed_mps / config.speed_limit_mps, 1.0)
+    fast = jnp.maximum(speed_mps / config.speed_limit_mps, 1.0)
     reward = (config.progress * jnp.where(gained > 0.0, gained / fast, gained)
               - config.comfort * terms["discomfort"] - config.speeding * terms["speeding"])
-    if touched is None:
-        return reward, jnp.zeros(reward.shape, jnp.bool_), terms
-    terms["collision"] = touched
-    likely = jnp.maximum(touched - config.tolerated_collision, 0.0) / (1.0 - config.tolerated_collision)
-    return reward - config.collision * likely, touched > config.terminal_collision, terms
+    if "collision" not in terms:
+        return reward
+    likely = jnp.maximum(terms["collision"] - config.tolerated_collision, 0.0) / (1.0 - config.tolerated_collision)
+    return reward - config.collision * likely
 
 
 LEARNED_HEADS = ("reward", "continue")

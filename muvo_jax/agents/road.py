@@ -47,17 +47,11 @@ def observe(motion: Motion, route: route_lib.Route | None, obstacles: Array, obs
     unit_m = jnp.asarray(np.maximum(ROUTE_AHEAD_M, NEAREST_UNIT_M))[:, None]
     turn = jnp.arctan2(jnp.sin(ahead[:, 2]), jnp.cos(ahead[:, 2])) / TURN_UNIT_RAD
     straight = jnp.stack([jnp.asarray(STRAIGHT_M), *2 * [jnp.zeros(STRAIGHT_M.size, jnp.float32)]], axis=-1)
-    places = jnp.concatenate([route_lib.ahead(route, motion.pose, CLEARANCE_M), _from(motion.pose, straight)])
+    places = jnp.concatenate([route_lib.ahead(route, motion.pose, CLEARANCE_M),
+                              motion_ops.placed(jnp.broadcast_to(motion.pose, straight.shape), straight)])
     blocked = rewards.box_collision(obstacles, motion_ops.relative(places, obstacles_pose[None]), grid, config.box,
                                     pooled=pooled)
     if seen is not None:
         blocked = jnp.maximum(blocked, rewards.box_collision(seen, places, grid, config.box))
     return jnp.concatenate([motion.speed_mps[None] / SPEED_UNIT_MPS, (ahead[:, :2] / unit_m).reshape(-1), turn,
                             jax.lax.stop_gradient(blocked) / PROBABILITY_UNIT])
-
-
-def _from(pose: Array, relative: Array) -> Array:
-    """Poses [N, 3] that a car at `pose` [3] calls `relative` [N, 3]: motion_ops.relative backwards."""
-    cosine, sine = jnp.cos(pose[2]), jnp.sin(pose[2])
-    return jnp.stack([pose[0] + cosine * relative[:, 0] - sine * relative[:, 1],
-                      pose[1] + sine * relative[:, 0] + cosine * relative[:, 1], pose[2] + relative[:, 2]], axis=-1)

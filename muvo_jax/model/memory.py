@@ -103,8 +103,7 @@ def of_window(config: ModelConfig, batch: Batch, states: LatentState,
     steps, speed_mps = measured.pose, measured.speed_mps
 
     def walk(pose, step):
-        following = motion_ops.moved(Motion(pose, pose[..., 0]), jnp.concatenate([step, step[..., :1]], -1)).pose
-        return following, pose
+        return motion_ops.placed(pose, step), pose
 
     _, poses = jax.lax.scan(walk, jnp.zeros_like(steps[:, 0]), jnp.swapaxes(steps, 0, 1))
     poses = jnp.swapaxes(poses, 0, 1)

@@ -56,10 +56,15 @@ def drive(motion: Motion, action: Array, contract: config_lib.ActionContract, pe
 
 def moved(motion: Motion, ego_motion: Array) -> Motion:
     """Applies a step [..., 4] as types.Batch.ego_motion and the head of that name have it; it brings its own speed."""
-    forward_m, left_m, turn_rad, speed_mps = jnp.moveaxis(ego_motion, -1, 0)
-    cosine, sine = jnp.cos(motion.pose[..., 2]), jnp.sin(motion.pose[..., 2])
-    step = jnp.stack([cosine * forward_m - sine * left_m, sine * forward_m + cosine * left_m, turn_rad], axis=-1)
-    return Motion(motion.pose + step, speed_mps)
+    return Motion(placed(motion.pose, ego_motion[..., :3]), ego_motion[..., 3])
+
+
+def placed(origin: Array, pose: Array) -> Array:
+    """`pose` [..., 3], as seen from `origin` [..., 3], in the frame of the origin: `relative` backwards."""
+    forward_m, left_m, turn_rad = jnp.moveaxis(pose, -1, 0)
+    cosine, sine = jnp.cos(origin[..., 2]), jnp.sin(origin[..., 2])
+    return origin + jnp.stack([cosine * forward_m - sine * left_m, sine * forward_m + cosine * left_m, turn_rad],
+                              axis=-1)
 
 
 def relative(pose: Array, origin: Array) -> Array:

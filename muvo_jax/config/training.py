@@ -51,7 +51,7 @@ class DataConfig:
       key_frames: only these, where a recording has them (nuScenes: 2 a second instead of 10).
       frames, stride: a training window is `frames` frames, each `stride` recorded frames apart.
       context, horizon: evaluation observes `context` frames and imagines `horizon` more.
-      town_seed, town_size: which town, and how much of it ("default", "tiny").
+      town_seed, town_size: which town, and how much of it ("default", "large", "tiny").
       cache_gib: decoded frames are kept in memory up to this size.
       workers: threads that read and decode batches ahead; 0 takes one for each processor but one, 2 to 16.
       skip_corrupt_shards: leave damaged shards of a packed recording out, counted, instead of stopping.

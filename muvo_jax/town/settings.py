@@ -82,6 +82,11 @@ SIZES = {
         "val_rl": Split(8, 60, TRAINING_WEATHERS, 2_000),
         "val_ds": Split(8, 60, HELD_OUT_WEATHERS, 3_000),
     },
+    "large": {  # for trainings of hours; the held-out drives are those of "default"
+        "train": Split(144, 100, TRAINING_WEATHERS, 1_000, restless=48),
+        "val_rl": Split(8, 60, TRAINING_WEATHERS, 2_000),
+        "val_ds": Split(8, 60, HELD_OUT_WEATHERS, 3_000),
+    },
     "tiny": {
         "train": Split(2, 12, TRAINING_WEATHERS, 1_000),
         "val_rl": Split(1, 12, TRAINING_WEATHERS, 2_000),

@@ -1,0 +1,113 @@
+"""What a study says of the paper's claims: differences of pairs of runs under one seed, with 95 % intervals."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from scipy import stats
+
+from experiments.studies import tables
+
+CONFIRMED, CONTRADICTED, UNDECIDED = "confirmed", "contradicted", "undecided"
+
+
+def value(run: Mapping[str, Any] | None, split: str, metric: str) -> float:
+    """A run's score; NaN where there is none."""
+    found = ((run or {}).get("scores", {}).get(split, {}).get(metric) or {}).get("mean")
+    return math.nan if found is None else float(found)
+
+
+def mean_and_interval(values: np.ndarray) -> tuple[float, float, float]:
+    """Mean and Student's 95 % interval of values [N]; the interval is NaN for fewer than two."""
+    if len(values) < 2:
+        return (float(values.mean()) if len(values) else math.nan), math.nan, math.nan
+    half = stats.t.ppf(0.975, len(values) - 1) * values.std(ddof=1) / math.sqrt(len(values))
+    return float(values.mean()), float(values.mean() - half), float(values.mean() + half)
+
+
+def verdict(low: float, high: float, says: str, margin: float) -> str:
+    """What the interval [low, high] of an effect, positive where the claim's first arm is better, does to a claim.
+
+    Args:
+      says: see tables.Claim.
+      margin: differences below it count as none.
+    """
+    if math.isnan(low):
+        return UNDECIDED
+    yes, no = {"better": (low > 0.0, high < 0.0), "par": (low > -margin, high < -margin),
+               "same": (low > -margin and high < margin, low > margin or high < -margin)}[says]
+    return CONFIRMED if yes else CONTRADICTED if no else UNDECIDED
+
+
+def pairs_needed(differences: np.ndarray, says: str, margin: float) -> int | None:
+    """How many pairs would tell, if the effect and its scatter are as they seem; None where that cannot be said."""
+    if len(differences) < 2 or not differences.std(ddof=1):
+        return None
+    mean = differences.mean()
+    distance = {"better": abs(mean), "par": abs(mean + margin), "same": abs(margin - abs(mean))}[says]
+    return None if not distance else max(2, math.ceil((2.0 * differences.std(ddof=1) / distance) ** 2))
+
+
+def of_claims(study: tables.Study, runs: Mapping[str, Mapping[str, Any]], suffix: str = "") -> list[dict[str, Any]]:
+    """A row for each claim, metric and split.
+
+    Args:
+      runs: label -> seed -> what queue.read returned; a missing run is left out of the pairs.
+      suffix: of the labels, "+memory" for the runs with memory.
+
+    Returns:
+      rows {"claim", "metric", "split", "pairs", "effect", "interval", "verdict", "pairs_needed"}; the effect is
+      positive where the claim's first arm is better.
+    """
+    rows = []
+    for claim in study.claims:
+        for metric in claim.metrics:
+            for split in claim.splits:
+                found = [value(runs.get(first + suffix, {}).get(seed), split, metric)
+                         - value(runs.get(second + suffix, {}).get(seed), split, metric)
+                         for first, second in claim.pairs for seed in runs.get(first + suffix, {})]
+                signed = np.array([item for item in found if not math.isnan(item)])
+                signed = -signed if metric in tables.LOWER_IS_BETTER else signed
+                mean, low, high = mean_and_interval(signed)
+                margin = tables.MARGINS[metric]
+                rows.append({"claim": claim.text, "metric": metric, "split": split, "pairs": len(signed),
+                             "effect": mean, "interval": [low, high], "verdict": verdict(low, high, claim.says, margin),
+                             "pairs_needed": pairs_needed(signed, claim.says, margin)})
+    return [row for row in rows if row["pairs"]] + (_order(study, runs, suffix) if study.order_kept else [])
+
+
+def _order(study: tables.Study, runs: Mapping[str, Mapping[str, Any]], suffix: str) -> list[dict[str, Any]]:
+    """Whether another domain costs image quality, and whether the arms keep their order there."""
+    metric, (known, other) = tables.PSNR, tables.SPLITS
+    both = {label: np.array([[value(run, split, metric) for split in (known, other)] for run in seeds.values()])
+            for label, seeds in runs.items() if label.endswith(suffix) and ("+" in label) == bool(suffix)}
+    means = np.array([np.nanmean(table, axis=0) for table in both.values() if np.isfinite(table).all(1).any()])
+    if len(means) < 3:
+        return []
+    drop = np.concatenate([table[np.isfinite(table).all(1)] @ np.array([1.0, -1.0]) for table in both.values()])
+    mean, low, high = mean_and_interval(drop)
+    rank = stats.spearmanr(means[:, 0], means[:, 1])
+    width = 1.96 / math.sqrt(max(len(means) - 3, 1))  # of Fisher's z
+    limits = [float(np.tanh(np.arctanh(np.clip(rank.statistic, -0.999, 0.999)) + sign * width)) for sign in (-1, 1)]
+    rows = [("another domain lowers PSNR", len(drop), mean, [low, high], verdict(low, high, "better", 0.0)),
+            ("another domain keeps the order of the arms (Spearman correlation)", len(means), float(rank.statistic),
+             limits, verdict(*limits, "better", 0.0))]
+    return [{"claim": claim, "metric": metric, "split": f"{known} to {other}", "pairs": count, "effect": effect,
+             "interval": interval, "verdict": said, "pairs_needed": None}
+            for claim, count, effect, interval, said in rows]
+
+
+def best_and_worst(study: tables.Study, runs: Mapping[str, Mapping[str, Any]]) -> tuple[str, str] | None:
+    """The arms without memory that the study's first metric ranks first and last on the first split.
+
+    None where fewer than two arms are complete.
+    """
+    metric = study.metrics[0]
+    means = {arm.name: np.mean([value(run, tables.SPLITS[0], metric) for run in runs.get(arm.name, {}).values()])
+             for arm in study.arms if runs.get(arm.name)}
+    ranked = sorted((name for name in means if math.isfinite(means[name])), key=lambda name: means[name],
+                    reverse=metric not in tables.LOWER_IS_BETTER)
+    return (ranked[0], ranked[-1]) if len(ranked) > 1 else None

@@ -1,0 +1,199 @@
+"""The studies of the paper: what is queued, what survives a death, and when a claim counts as confirmed."""
+
+import json
+import math
+import pathlib
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+import tyro
+
+import muvo_jax
+from experiments import run as study_command
+from experiments.studies import effects, queue, report, tables
+from muvo_jax import command_line, train
+from muvo_jax.viz import curves
+
+ROOT = pathlib.Path(muvo_jax.__file__).parents[1]
+
+
+def _run_of(psnr, chamfer=1.0, step=400):
+    scores = {split: {tables.PSNR: {"mean": psnr - drop, "interval": [0, 0]},
+                      tables.CHAMFER: {"mean": chamfer, "interval": [0, 0]}}
+              for split, drop in zip(tables.SPLITS, (0.0, 1.0), strict=True)}
+    return {"steps": step, "parameters": 1000, "processor_s": 36.0, "protocol": "p", "scores": scores,
+            "baselines": {"training_mean": scores},
+            "curves": {split: {tables.PSNR: [[1, 1.0], [2, psnr]]} for split in tables.SPLITS}}
+
+
+@pytest.mark.parametrize("study", tables.STUDIES.values(), ids=list(tables.STUDIES))
+@pytest.mark.parametrize("scale", tables.SCALES)
+def test_every_arm_is_a_configuration_that_train_takes(study, scale, tmp_path):
+    variants = {}
+    for job in queue.jobs(study, scale, 1):
+        if job.arm.after:
+            assert job.arm.after in {arm.name for arm in study.planned(scale)}
+            continue
+        flags = queue.flags(study, scale, job, tmp_path)
+        config, _, folder = train.configure(tyro.cli(train.Options, args=flags))
+        assert folder == tmp_path / job.name
+        assert config.model.first_guess.kind == ("training_mean" if scale == "town" else "zero")
+        variants[job.name] = config.model
+    assert len(set(variants.values())) == len(variants)  # no two arms are the same network
+
+
+def test_memory_is_added_to_the_settings_and_the_run_before_is_that_with_memory(tmp_path):
+    arm = next(arm for arm in tables.OCCUPANCY.arms if arm.name == "PTF")
+    flags = queue.flags(tables.OCCUPANCY, "town", queue.Job(arm, 1, memory=True), tmp_path)
+    settings = flags[flags.index("--set") + 1 :]
+    assert "model.first_guess=last_seen" in settings and "model.first_guess=training_mean" not in settings
+    assert "train.trainable=decoders_occupancy" in settings
+    assert f"--init={tmp_path}/SENSORS+memory-s1" in flags
+    assert flags.count("--set") == 1
+
+
+def test_shards_share_out_all_runs_and_keep_chains_together():
+    planned = queue.jobs(tables.OCCUPANCY, "town", 3)
+    parts = [queue.of_shard(planned, index, 2) for index in range(2)]
+    assert sorted(job.name for part in parts for job in part) == sorted(job.name for job in planned)
+    for part in parts:
+        names = [job.name for job in part]
+        for job in part:
+            if job.arm.after:
+                assert names.index(f"{job.arm.after}-s{job.seed}") < names.index(job.name)
+
+
+def test_a_run_that_dies_is_tried_once_more_then_left_out_and_counted(tmp_path, monkeypatch):
+    calls, said = [], []
+
+    def dies(command, log):
+        calls.append(command)
+        log.write_text("boom\n")
+        return 1, 2.0
+
+    monkeypatch.setattr(queue, "_run", dies)
+    job = queue.jobs(tables.FUSION, "smoke", 1)[0]
+    assert not queue.make(tables.FUSION, "smoke", job, tmp_path, said.append)
+    assert len(calls) == 2
+    assert not queue.make(tables.FUSION, "smoke", job, tmp_path, said.append)
+    assert len(calls) == 2 and "left out" in said[-1]
+    assert (tmp_path / job.name / queue.LOG).read_text() == "boom\n"
+    found = queue.read(tmp_path, job, tables.FUSION)
+    assert "died 2 times" in found["died"]
+    results = {"runs": {job.label: {"0": found}}, "command": "c", "commit": "d", "code": "e", "machine": "m"}
+    report.write(tmp_path / "out", tables.FUSION, results)
+    assert "Left out, died twice: RV-WOB-TR, seed 0 (1 in all)." in (tmp_path / "out" / report.REPORT).read_text()
+
+
+def test_a_stopped_run_is_resumed_and_a_folder_without_checkpoint_is_set_aside(tmp_path, monkeypatch):
+    commands = []
+
+    def finishes(command, log):
+        commands.append(command)
+        (tmp_path / job.name).mkdir(exist_ok=True)
+        (tmp_path / job.name / queue.EVALUATION).write_text("{}")
+        return 0, 1.0
+
+    monkeypatch.setattr(queue, "_run", finishes)
+    job, other = queue.jobs(tables.FUSION, "smoke", 1)
+    (tmp_path / job.name / "checkpoints" / "100").mkdir(parents=True)
+    assert queue.make(tables.FUSION, "smoke", job, tmp_path, lambda line: None)
+    assert commands[-1][-1] == "--resume"
+    job = other
+    (tmp_path / job.name).mkdir()
+    assert queue.make(tables.FUSION, "smoke", job, tmp_path, lambda line: None)
+    assert "--resume" not in commands[-1]
+    assert (tmp_path / f"{job.name}.stopped0").is_dir()
+
+
+@pytest.mark.parametrize(("low", "high", "says", "expected"), [
+    (0.1, 0.3, "better", effects.CONFIRMED), (-0.3, -0.1, "better", effects.CONTRADICTED),
+    (-0.1, 0.3, "better", effects.UNDECIDED), (-0.1, 0.3, "par", effects.CONFIRMED),
+    (-0.5, -0.3, "par", effects.CONTRADICTED), (-0.1, 0.1, "same", effects.CONFIRMED),
+    (0.3, 0.5, "same", effects.CONTRADICTED), (0.1, 0.5, "same", effects.UNDECIDED),
+    (math.nan, math.nan, "better", effects.UNDECIDED)])
+def test_verdicts(low, high, says, expected):
+    assert effects.verdict(low, high, says, margin=0.2) == expected
+
+
+def test_the_interval_is_students():
+    # values 1, 2, 3: mean 2, standard error 1 / sqrt(3), t of two degrees of freedom 4.3027
+    mean, low, high = effects.mean_and_interval(np.array([1.0, 2.0, 3.0]))
+    np.testing.assert_allclose([mean, low, high], [2.0, 2.0 - 4.3027 / 3**0.5, 2.0 + 4.3027 / 3**0.5], atol=1e-4)
+    assert math.isnan(effects.mean_and_interval(np.array([1.0]))[1])
+
+
+def test_claims_compare_runs_of_one_seed_and_turn_chamfer_round():
+    runs = {f"{lidar}-{camera}-{fusion}": {str(seed): _run_of(20.0 + (lidar == "RV") + 0.3 * seed + 0.1 * place,
+                                                              chamfer=1.0 - 0.1 * (lidar == "RV"))
+                                           for seed in range(2)}
+            for place, (lidar, camera, fusion) in enumerate(
+                (lidar, camera, fusion) for lidar in ("RV", "PP") for camera in ("WOB", "BEV")
+                for fusion in ("TR", "FC", "AVG"))}
+    rows = {(row["claim"], row["metric"], row["split"]): row for row in effects.of_claims(tables.FUSION, runs)}
+    beats = rows["range view beats PointPillars", tables.PSNR, "val_rl"]
+    assert beats["pairs"] == 12 and beats["effect"] == pytest.approx(1.0 - 0.6)  # six places on
+    assert rows["range view beats PointPillars", tables.CHAMFER, "val_ds"]["effect"] == pytest.approx(0.1)
+    assert rows["range view beats PointPillars", tables.CHAMFER, "val_ds"]["verdict"] == effects.CONFIRMED
+    drop = rows["another domain lowers PSNR", tables.PSNR, "val_rl to val_ds"]
+    assert drop["effect"] == pytest.approx(1.0) and drop["verdict"] == effects.CONFIRMED
+    order = rows["another domain keeps the order of the arms (Spearman correlation)", tables.PSNR, "val_rl to val_ds"]
+    assert order["effect"] == pytest.approx(1.0)
+    assert effects.best_and_worst(tables.FUSION, runs) == ("RV-BEV-AVG", "PP-WOB-TR")
+
+
+def test_the_report_is_one_page_with_its_pictures(tmp_path):
+    results = {"runs": {"RV-WOB-TR": {"0": _run_of(20.0), "1": _run_of(21.0)}, "PP-WOB-TR": {"0": _run_of(19.0),
+               "1": None}}, "command": "c", "commit": "d", "code": "e", "machine": "m"}
+    report.write(tmp_path, tables.FUSION, results)
+    text, page = (tmp_path / report.REPORT).read_text(), (tmp_path / report.PAGE).read_text()
+    assert "| RV-WOB-TR | 2 | 20.500 (20.000..21.000) |" in text
+    assert "Not complete yet: 1 of the planned runs" in text
+    assert 'src="data:image/png;base64,' in page and "http" not in page
+    assert json.loads((tmp_path / report.RESULTS).read_text()) == results
+
+
+def test_results_of_other_code_are_refused_and_both_are_named(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(command_line, "use_compilation_cache", lambda: None)
+    folder = tmp_path / "fusion-smoke"
+    folder.mkdir()
+    (folder / report.RESULTS).write_text(json.dumps(
+        {"study": "fusion", "scale": "smoke", "data": None, "code": "0ld", "commit": "abc1234", "runs": {}}))
+    code = command_line.run(study_command.Options, study_command.run, program="run",
+                            arguments=["fusion", "--scale=smoke", f"--runs-dir={tmp_path}"])
+    error = capsys.readouterr().err
+    assert code == 1 and "'0ld' (commit abc1234)" in error and queue.code_fingerprint() in error
+
+
+@pytest.mark.parametrize(("arguments", "message"), [
+    (["fuson"], "known are fusion, latent, occupancy. Did you mean fusion"),
+    (["fusion", "--scale=twon"], "Did you mean town"), (["fusion", "--shard=2/2"], "an index from 0 to COUNT - 1"),
+    (["fusion", "--scale=paper"], "give --data=PATH")])
+def test_wrong_words_are_named_with_their_neighbours(arguments, message, capsys, monkeypatch):
+    monkeypatch.setattr(command_line, "use_compilation_cache", lambda: None)
+    assert command_line.run(study_command.Options, study_command.run, program="run", arguments=arguments) == 1
+    assert message in capsys.readouterr().err
+
+
+def test_bands_are_drawn_and_legends_wrap():
+    series = {f"an arm with a long name {index}": ([0, 1, 2], [index, index + 1.0, index]) for index in range(4)}
+    name = next(iter(series))
+    plain = curves.curve(series, "t")
+    banded = curves.curve(series, "t", bands={name: ([-1.0, 0.0, -1.0], [1.0, 2.0, 1.0])})
+    assert plain.shape == banded.shape and (plain != banded).any()
+    rows = {row for row, _ in curves._legend(series, 52, 350).values()}
+    assert len(rows) > 1
+
+
+@pytest.mark.slow
+def test_the_smoke_scale_of_all_studies_runs(tmp_path):
+    for name in tables.STUDIES:
+        subprocess.run([sys.executable, "-m", "experiments.run", name, "--scale=smoke", f"--runs-dir={tmp_path}"],
+                       cwd=ROOT, check=True, timeout=900)
+        results = json.loads((tmp_path / f"{name}-smoke" / report.RESULTS).read_text())
+        runs = [run for seeds in results["runs"].values() for run in seeds.values()]
+        assert len(runs) == len(tables.STUDIES[name].planned("smoke"))
+        assert all(run and run["steps"] == 2 and run["scores"]["val_rl"] for run in runs), name
+        assert (tmp_path / f"{name}-smoke" / report.CURVES).is_file()

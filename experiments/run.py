@@ -25,7 +25,8 @@ class Options:
     """Trains every arm of a study under several seeds, one process after the other, then its best and its worst arm
     again with memory, and reports what the paper's claims come to.
 
-    Stopped, it goes on when called again. A run that dies is tried once more, then left out and counted.
+    Stopped, it goes on when called again: with the runs in RUNS_DIR, and where those are gone, with the runs that
+    results.json has no scores of. A run that dies is tried once more, then left out and counted.
     """
 
     name: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="NAME")]
@@ -80,12 +81,18 @@ def _results(options: Options, study: tables.Study, folder: pathlib.Path, planne
              existing: dict[str, Any] | None) -> dict[str, Any]:
     runs: dict[str, dict[str, Any]] = {}
     for job in planned:
-        runs.setdefault(job.label, {})[str(job.seed)] = queue.read(folder, job, study)
+        runs.setdefault(job.label, {})[str(job.seed)] = queue.read(folder, job, study) or _recorded(existing, job)
     kept = {name: existing[name] for name in ("command", "commit", "machine")} if existing else {}
     words = shlex.join(["python", "-m", "experiments.run", *sys.argv[1:]])
     return {"study": study.name, "scale": options.scale, "code": queue.code_fingerprint(), "data": options.data,
             "command": words, "commit": queue.commit(),
             "machine": f"{os.cpu_count()} cores of {platform.machine()}, {platform.system()}", **kept, "runs": runs}
+
+
+def _recorded(existing: dict[str, Any] | None, job: queue.Job) -> dict[str, Any] | None:
+    """What results of an earlier sitting say of a run whose folder is gone."""
+    found = (existing or {}).get("runs", {}).get(job.label, {}).get(str(job.seed))
+    return found if found and "died" not in found else None
 
 
 def _check_same(existing: dict[str, Any], options: Options, study: tables.Study, path: pathlib.Path) -> None:
@@ -120,10 +127,10 @@ def run(options: Options, show: screen.Screen) -> None:
             show.line("nothing started: add --yes to start.")
             return
     folder.mkdir(parents=True, exist_ok=True)
-    path = folder / report.RESULTS
-    existing = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else None
+    known = [place / report.RESULTS for place in (folder, options.out) if place and (place / report.RESULTS).is_file()]
+    existing = json.loads(known[0].read_text(encoding="utf-8")) if known else None
     if existing:
-        _check_same(existing, options, study, path)
+        _check_same(existing, options, study, known[0])
 
     def save(jobs: list[queue.Job]) -> dict[str, Any]:
         with processes.locked(folder / ".lock", "reporting", wait=True):
@@ -134,8 +141,10 @@ def run(options: Options, show: screen.Screen) -> None:
         return results
 
     def make(jobs: list[queue.Job]) -> None:
+        started_from = {(job.arm.after, job.seed) for job in jobs if job.arm.after and not _recorded(existing, job)}
         for index, job in enumerate(mine := queue.of_shard(jobs, *shard)):
-            if not options.only_report and not (folder / job.name / queue.EVALUATION).is_file():
+            recorded = _recorded(existing, job) and (job.arm.name, job.seed) not in started_from
+            if not (options.only_report or recorded or (folder / job.name / queue.EVALUATION).is_file()):
                 show.line(f"run {index + 1} of {len(mine)}:")
                 queue.make(study, scale, job, folder, show.line, extra)
                 save(planned)

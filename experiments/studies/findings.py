@@ -1,4 +1,4 @@
-"""python -m experiments.studies.findings: writes what committed results say of each claim into experiments/README.md."""
+"""What committed results say of each claim, into experiments/README.md: python -m experiments.studies.findings"""
 
 from __future__ import annotations
 

@@ -89,6 +89,7 @@ def check(model: WorldModel, bank: StartBank) -> None:
     for name, (index, count) in indices.items():
         if isinstance(index, jax.core.Tracer):
             continue
+        index = np.asarray(index)  # concrete where the rest is traced, too
         if jnp.shape(index) != lead or np.min(index) < 0 or np.max(index) >= count:
             raise ValueError(f"StartBank: {name} {list(jnp.shape(index))} reaches from {np.min(index)} to "
                              f"{np.max(index)}, but the memory holds {windows} windows of {frames} observations and "

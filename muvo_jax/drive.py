@@ -20,7 +20,16 @@ with late.imports():
 
     from muvo_jax import drive_report, evaluation_report, town_drive
     from muvo_jax import run as run_lib
-    from muvo_jax.agents import closed_loop, drive_scores, environment, planners, policy_file, rewards, sensitivity
+    from muvo_jax.agents import (
+        closed_loop,
+        drive_scores,
+        environment,
+        planners,
+        policy_file,
+        rewards,
+        sensitivity,
+        uncertainty,
+    )
     from muvo_jax.data import words
     from muvo_jax.town import settings, simulator
     from muvo_jax.training import checkpoint_meta, screen
@@ -68,6 +77,11 @@ class Options:
     occupancy_scale: Literal[1, 2, 4] = 1
     """Look for collisions in the occupancy at 1, 1/2 or 1/4 of its resolution: coarser is faster and more cautious, and
     too coarse is refused."""
+    trust: tuple[float, ...] = ()
+    """What a reward of imagined step 1, 2, ... counts, such as the trust of evaluate --uncertainty; later ones count as
+    the last. By default all count in full."""
+    branches: int = 1
+    """Futures drawn of each step; obstacles are where the worst of them has one. So many times the decoding."""
     sensitivity: bool = True
     """Measure how imagination answers to actions."""
     seed: int = 0
@@ -104,6 +118,7 @@ def drive(options: Options, show: screen.Screen) -> dict[str, Any]:
     report = {"run": str(loaded.folder), "step": loaded.step, "agents": names, "planner": options.planner,
               "horizon": options.horizon, "plans": options.plans, "iterations": options.iterations,
               "occupancy_scale": options.occupancy_scale, "futures": options.futures,
+              "trust": options.trust, "branches": options.branches,
               "speed_limit_mps": options.speed_limit_mps, "step_s": world.step_s, "seconds": options.seconds,
               "seeds": seeds, "route_m": town.config.route_m, "scores": scores,
               "drives": {name: [drive_report.describe(one, seed) for one, seed in zip(runs, seeds, strict=True)]
@@ -169,7 +184,8 @@ def _planner(options, loaded, world, show):
                   style="dim")
     imagination = environment.Environment.of_run(loaded, reward_config=rewards.RewardConfig(
         occupancy_scale=options.occupancy_scale, speed_limit_mps=options.speed_limit_mps,
-        collision=rewards.RewardConfig.collision if sees else 0.0))
+        collision=rewards.RewardConfig.collision if sees else 0.0),
+        caution=uncertainty.Caution(options.trust, options.branches))
     return closed_loop.planning_driver(world, imagination, loaded.variables, *planner_of(options),
                                        horizon=options.horizon, shared_future=options.futures == "one")
 

@@ -20,7 +20,15 @@ with late.imports():
 
     from muvo_jax import evaluation_report, town_drive
     from muvo_jax import run as run_lib
-    from muvo_jax.agents import actor_critic, closed_loop, environment, policy_file, real_rewards, rewards
+    from muvo_jax.agents import (
+        actor_critic,
+        closed_loop,
+        environment,
+        policy_file,
+        real_rewards,
+        rewards,
+        uncertainty,
+    )
     from muvo_jax.agents import futures as futures_lib
     from muvo_jax.data import words
     from muvo_jax.model import rollout
@@ -64,6 +72,11 @@ class Options:
     """Of the agent's optimiser."""
     speed_limit_mps: float = 8.0
     """What the reward calls too fast; drivers of the town like 8 to 10 m/s."""
+    trust: tuple[float, ...] = ()
+    """What a reward of imagined step 1, 2, ... counts, such as the trust of evaluate --uncertainty; later ones count as
+    the last. By default all count in full."""
+    branches: int = 1
+    """Futures drawn of each step; obstacles are where the worst of them has one. So many times the decoding."""
     judge_every: int = 5
     """Judge in the town after each so many rounds; 0: never."""
     judge_drives: int = 4
@@ -89,7 +102,7 @@ def train_agent(options: Options, show: screen.Screen) -> dict[str, Any]:
             raise ValueError(f"--{name} is {getattr(options, name)}; it must be at least 1.")
     loaded = command_line.load_run(options.run, options.checkpoint, show)
     world = environment.Environment.of_run(loaded, observation="road", reward_config=rewards.RewardConfig(
-        speed_limit_mps=options.speed_limit_mps))
+        speed_limit_mps=options.speed_limit_mps), caution=uncertainty.Caution(options.trust, options.branches))
     futures_lib.check(world)
     config = actor_critic.ActorCriticConfig(starts=options.batch, horizon=HORIZON, discount=0.97, clip_norm=1.0,
                                             learning_rate=options.learning_rate)

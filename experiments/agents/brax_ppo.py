@@ -1,4 +1,10 @@
-"""Brax's own PPO, trained in imagination: python experiments/agents/brax_ppo.py [--run=runs/town-tr] [--steps=20000]"""
+"""Brax's own PPO, trained in imagination, through the brax door.
+
+    python experiments/agents/brax_ppo.py [--run=RUN] [--steps=...]
+
+With a run it learns to drive: in futures that its policy imagined from recorded moments (agents/futures.py), a few
+times anew; then the town judges it. Without one it shows that brax runs through the door.
+"""
 
 import argparse
 
@@ -14,20 +20,55 @@ if not hasattr(jax, "device_put_replicated"):
     jax.device_put_replicated = lambda tree, devices: jax.tree.map(lambda leaf: jnp.stack([leaf] * len(devices)), tree)
 
 
-def main():
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--run")
-    parser.add_argument("--steps", type=int, default=20_000)
-    parser.add_argument("--horizon", type=int, default=15)
-    options = parser.parse_args()
-    env = brax_env.BraxImagination(*worlds.load(options.run, options.horizon))
-    ppo.train(
-        environment=env, num_timesteps=options.steps, episode_length=env.episode_length, num_envs=64, batch_size=64,
-        num_minibatches=4, num_updates_per_batch=4, unroll_length=5, num_evals=3, num_eval_envs=64, learning_rate=1e-3,
-        entropy_cost=1e-3, discounting=0.97, reward_scaling=1.0, normalize_observations=True, seed=0,
-        progress_fn=lambda step, metrics: print(
+
+
+def train(env, steps, seed=0, restore=None, **options):
+    """Brax's PPO; (make_policy, params, metrics) of brax."""
+    return ppo.train(
+        environment=env, num_timesteps=steps, episode_length=env.episode_length, num_minibatches=4,
+        num_updates_per_batch=4, num_evals=3, num_eval_envs=64, learning_rate=1e-3, entropy_cost=1e-3, discounting=0.97,
+        normalize_observations=True, seed=seed, restore_params=restore, progress_fn=lambda step, metrics: print(
             f"{step:7d} steps: return of an episode {metrics['eval/episode_reward']:.3f} "
-            f"(length {metrics['eval/avg_episode_length']:.1f})", flush=True))
+            f"(length {metrics['eval/avg_episode_length']:.1f})", flush=True), **options)
+
+
+def learn_to_drive(options):
+    """Rounds of imagining futures under the policy and learning in them; then the policy drives in the town."""
+    dreams, restore, policy = worlds.Dreams(options.run), None, jax.tree_util.Partial(noisy_coasting)
+    for index in range(options.rounds + 1):
+        imagined = dreams.futures(jax.random.fold_in(jax.random.key(0), index), policy)
+        print(worlds.told(index, imagined, index * options.steps // options.rounds), flush=True)
+        if index < options.rounds:
+            env = brax_env.BraxImagination(dreams.core, dreams.core.params(imagined))
+            make_policy, restore, _ = train(
+                env, options.steps // options.rounds, seed=index, restore=restore, num_envs=512, batch_size=512,
+                unroll_length=12, reward_scaling=0.1, num_resets_per_eval=10)
+            policy = jax.tree_util.Partial(act, make_policy(restore, deterministic=False))
+    policy = jax.tree_util.Partial(act, make_policy(restore, deterministic=True))
+    print(dreams.judge(policy, options.drives), flush=True)
+
+
+def noisy_coasting(key, observation):
+    return jnp.tanh(0.5 * jax.random.normal(key, (2,)))
+
+
+def act(inference, key, observation):
+    return jnp.clip(inference(observation, key)[0], -1.0, 1.0)
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--run")
+    parser.add_argument("--steps", type=int, help="20,000 without a run, else 600,000")
+    parser.add_argument("--horizon", type=int, default=15, help="without a run")
+    parser.add_argument("--rounds", type=int, default=3, help="of imagining and learning, with a run")
+    parser.add_argument("--drives", type=int, default=16, help="that judge it, with a run")
+    options = parser.parse_args()
+    options.steps = options.steps or (600_000 if options.run else 20_000)
+    if options.run:
+        return learn_to_drive(options)
+    train(brax_env.BraxImagination(*worlds.load(None, options.horizon)), options.steps, num_envs=64, batch_size=64,
+          unroll_length=5, reward_scaling=1.0)
 
 
 if __name__ == "__main__":

@@ -1,6 +1,9 @@
 """PPO as one jitted program, after the pattern of PureJaxRL, through the gymnax door.
 
-    python experiments/agents/gymnax_ppo.py [--run=runs/town-tr] [--steps=50000]
+    python experiments/agents/gymnax_ppo.py [--run=RUN] [--steps=...]
+
+With a run it learns to drive: in futures that its policy imagined from recorded moments (agents/futures.py), a few
+times anew; then the town judges it. Without one it shows that such a program runs through the door.
 
 Of the environment it knows gymnax's interface alone. Advantages bootstrap from `info["final_observation"]` where an
 episode was truncated, and from nothing where it terminated.
@@ -98,14 +101,15 @@ def loss(network, config, params, data):
     return policy + config.value_weight * critic - config.entropy_weight * jnp.log(std).sum()
 
 
-def make_train(env, env_params, config: PPOConfig, updates: int):
-    """train(key) -> mean return [updates] of the episodes that ended in each update (nan where none did)."""
-    network = ActorCritic(env.action_space(env_params).shape[0], config.width)
+def make_train(env, config: PPOConfig, updates: int):
+    """(init(key) -> learner, train(learner, key, env_params) -> learner and the mean return [updates] of the episodes
+    that ended in each update, nan where none did)."""
+    network = ActorCritic(2, config.width)
     optimizer = optax.chain(optax.clip_by_global_norm(config.max_grad_norm), optax.adam(config.learning_rate))
     reset = jax.vmap(env.reset, (0, None))
     advance = jax.vmap(env.step, (0, 0, 0, None))
 
-    def act(params, carry, key):
+    def act(params, env_params, carry, key):
         observation, state, so_far = carry
         key_action, key_step = jax.random.split(key)
         mean, std, value = network.apply(params, observation)
@@ -133,35 +137,83 @@ def make_train(env, env_params, config: PPOConfig, updates: int):
 
         return jax.lax.scan(minibatch, carry, order)[0], None
 
-    def update(carry, key):
+    def update(env_params, carry, key):
         learner, driving = carry
         key_act, key_learn = jax.random.split(key)
-        driving, steps = jax.lax.scan(functools.partial(act, learner[0]), driving,
+        driving, steps = jax.lax.scan(functools.partial(act, learner[0], env_params), driving,
                                       jax.random.split(key_act, config.unroll))
         learner, _ = jax.lax.scan(functools.partial(epoch, steps=steps), learner,
                                   jax.random.split(key_learn, config.epochs))
         return (learner, driving), steps.finished_return.sum() / steps.done.sum()
 
-    def train(key):
-        key_network, key_reset, key_train = jax.random.split(key, 3)
-        observation, state = reset(jax.random.split(key_reset, config.envs), env_params)
-        params = network.init(key_network, observation)
-        carry = ((params, optimizer.init(params)), (observation, state, jnp.zeros(config.envs)))
-        return jax.lax.scan(update, carry, jax.random.split(key_train, updates))[1]
+    def init(key):
+        shape = env.observation_space(env.default_params).shape
+        params = network.init(key, jnp.zeros((config.envs, *shape)))
+        return params, optimizer.init(params)
 
-    return train
+    def train(learner, key, env_params):
+        key_reset, key_train = jax.random.split(key)
+        observation, state = reset(jax.random.split(key_reset, config.envs), env_params)
+        carry = (learner, (observation, state, jnp.zeros(config.envs)))
+        (learner, _), returns = jax.lax.scan(functools.partial(update, env_params), carry,
+                                             jax.random.split(key_train, updates))
+        return learner, returns
+
+    return init, jax.jit(train)
+
+
+def drawn(config, params, key, observation):
+    """The policy that learns: a drawn action of one observation."""
+    mean, std, _ = ActorCritic(2, config.width).apply(params, observation)
+    return jnp.clip(mean + std * jax.random.normal(key, mean.shape), -1.0, 1.0)
+
+
+def mode(config, params, key, observation):
+    """The policy that is judged."""
+    return jnp.clip(ActorCritic(2, config.width).apply(params, observation)[0], -1.0, 1.0)
+
+
+def learn_to_drive(options):
+    """Rounds of imagining futures under the policy and learning in them; then the policy drives in the town."""
+    dreams, config = worlds.Dreams(options.run), PPOConfig(envs=512, unroll=12)
+    per_round = options.steps // options.rounds
+    updates = max(1, per_round // (config.envs * config.unroll))
+    learner = train = None
+    for index in range(options.rounds + 1):
+        key_dream, key_learn = jax.random.split(jax.random.fold_in(jax.random.key(0), index))
+        policy = jax.tree_util.Partial(functools.partial(drawn, config), learner[0] if learner else None)
+        if learner is None:
+            policy = jax.tree_util.Partial(lambda key, seen: jnp.tanh(0.5 * jax.random.normal(key, (2,))))
+        imagined = dreams.futures(key_dream, policy)
+        print(worlds.told(index, imagined, index * updates * config.envs * config.unroll), flush=True)
+        if index == options.rounds:
+            break
+        env = gymnax_env.GymnaxImagination(dreams.core, dreams.core.params(imagined))
+        if train is None:
+            init, train = make_train(env, config, updates)
+            learner = init(key_learn)
+        learner, returns = train(learner, key_learn, env.default_params)
+        print(f"return of an episode {returns[0]:.3f} to {returns[-1]:.3f}", flush=True)
+    policy = jax.tree_util.Partial(functools.partial(mode, config), learner[0])
+    print(dreams.judge(policy, options.drives), flush=True)
 
 
 def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--run")
-    parser.add_argument("--steps", type=int, default=50_000)
-    parser.add_argument("--horizon", type=int, default=15)
+    parser.add_argument("--steps", type=int, help="50,000 without a run, else 1,200,000")
+    parser.add_argument("--horizon", type=int, default=15, help="without a run")
+    parser.add_argument("--rounds", type=int, default=6, help="of imagining and learning, with a run")
+    parser.add_argument("--drives", type=int, default=16, help="that judge it, with a run")
     options = parser.parse_args()
+    options.steps = options.steps or (1_200_000 if options.run else 50_000)
+    if options.run:
+        return learn_to_drive(options)
     config = PPOConfig()
-    env = gymnax_env.GymnaxImagination(*worlds.load(options.run, options.horizon))
+    env = gymnax_env.GymnaxImagination(*worlds.load(None, options.horizon))
     updates = max(1, options.steps // (config.envs * config.unroll))
-    returns = jax.jit(make_train(env, env.default_params, config, updates))(jax.random.key(0))
+    init, train = make_train(env, config, updates)
+    _, returns = train(init(jax.random.key(0)), jax.random.key(1), env.default_params)
     for index in sorted({round(share * (updates - 1)) for share in (0, 0.25, 0.5, 0.75, 1)}):
         print(f"{(index + 1) * config.envs * config.unroll:7d} steps: return of an episode {returns[index]:.3f}")
 

@@ -4,8 +4,12 @@ import jax
 import jax.numpy as jnp
 
 import muvo_jax
-from muvo_jax import presets
-from muvo_jax.agents import environment, rewards
+from muvo_jax import presets, town_drive, train_agent
+from muvo_jax.agents import closed_loop, drive_scores, environment, futures, rewards
+from muvo_jax.town import settings, simulator
+from muvo_jax.training import checkpoint
+
+SPEED_LIMIT_MPS = 8.0  # as train_agent and drive have it
 
 
 def load(run: str | None, horizon: int) -> tuple[environment.Environment, environment.EnvParams]:
@@ -29,3 +33,49 @@ def load(run: str | None, horizon: int) -> tuple[environment.Environment, enviro
     world = muvo_jax.Environment.of_run(loaded)
     bank = world.starts(observed, batch, skip=loaded.config.data.context - 1)
     return world, world.params(loaded.variables, bank, horizon)
+
+
+class Dreams:
+    """A run as train_agent uses it: recorded moments from which policies imagine futures, in which agents then drive.
+
+    Policies are jax.tree_util.Partial (key, observation "road") -> action.
+    """
+
+    def __init__(self, run: str, starts: int = 256):
+        self.run = checkpoint.load_run(run, "latest")
+        self.world = environment.Environment.of_run(self.run, observation="road", reward_config=rewards.RewardConfig(
+            speed_limit_mps=SPEED_LIMIT_MPS))
+        self.recorded = train_agent.recorded_params(self.world, self.run, starts)
+        self.core = futures.SharedFutures(self.world)
+
+    def futures(self, key, policy) -> futures.Futures:
+        """One from each recorded moment, 64 at a time."""
+        starts = jnp.arange(self.recorded.bank.size).reshape(-1, 64)
+        parts = [futures.imagine(self.world, self.recorded, jax.random.fold_in(key, index), part, policy,
+                                 train_agent.HORIZON) for index, part in enumerate(starts)]
+        return jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *parts)
+
+    def judge(self, policy, drives: int) -> str:
+        """What a policy is worth in the town, by the loop, the seeds and the scores of muvo_jax.drive."""
+        town = simulator.Town(settings.from_config(self.run.config))
+        simulated = town_drive.town_simulator(town, self.run.config)
+        drivers = {"policy": closed_loop.policy_driver(simulated, self.world, self.run.variables, policy),
+                   "expert": closed_loop.expert_driver(simulated)}
+        steps, context = round(10.0 / simulated.step_s), self.run.config.data.context
+        driven = {name: [closed_loop.drive(simulated, driver, jax.random.fold_in(jax.random.key(0), seed), seed, steps,
+                                           context=context)
+                         for seed in range(town_drive.FIRST_SEED, town_drive.FIRST_SEED + drives)]
+                  for name, driver in drivers.items()}
+        found = drive_scores.summarise(driven, route_m=town.config.route_m, step_s=simulated.step_s, expert="expert")
+        score = found["policy"]
+        low, high = score["success_interval"]
+        return (f"{drives} drives in the town: success {score['success']:.0%} [{low:.0%}..{high:.0%}], "
+                f"{score['collisions']} collisions, {score['lost']} off route, {score['progress_m']:.1f} m, "
+                f"{score['progress']:.0%} of the expert's metres, {score['hard_share']:.1%} of steps above 3 m/s2")
+
+
+def told(index: int, futures_: futures.Futures, steps: int) -> str:
+    """A round's line: what a step of imagination earned under the policy that imagined these futures."""
+    scores = train_agent.imagined_scores(futures_)
+    return (f"round {index}, after {steps} steps: a step of imagination earns {scores['imagined_reward']:.3f}, "
+            f"{scores['imagined_ends']:.0%} of drives end early")

@@ -8,6 +8,13 @@ import jax
 import numpy as np
 
 
+def first_call_s(function: Callable[[], Any]) -> float:
+    """Processor seconds of the next call, of a function that was not called before: tracing and compilation."""
+    start = time.process_time()
+    jax.block_until_ready(function())
+    return time.process_time() - start
+
+
 def processor_seconds(functions: Mapping[str, Callable[[], Any]], rounds: int) -> dict[str, np.ndarray]:
     """Seconds [rounds] that all threads together spent in each function; compilation left out.
 

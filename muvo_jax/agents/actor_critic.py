@@ -215,7 +215,7 @@ def improve(environment: environment_lib.Environment, config: ActorCriticConfig,
     """
     futures_lib.check(environment)
     key_start, key_act = jax.random.split(key)
-    start = futures_lib.scattered(key_start, futures)
+    start = futures_lib.scattered(key_start, futures.speed_mps)
     noise = jax.random.normal(key_act, (futures.horizon, futures.count, environment_lib.ACTION_CHANNELS), jnp.float32)
 
     def drives(actor):

@@ -18,14 +18,13 @@ import jax.numpy as jnp
 
 from muvo_jax import config as config_lib
 from muvo_jax import run as run_lib
-from muvo_jax.agents import episodes, forks, rewards, road
-from muvo_jax.agents import route as route_lib
+from muvo_jax.agents import episodes, forks, rewards, road, uncertainty
 from muvo_jax.agents.episodes import EnvParams, EnvState, StartBank, Transition
 from muvo_jax.model import checks
 from muvo_jax.model import memory as memory_lib
 from muvo_jax.model.world_model import WorldModel
 from muvo_jax.ops import motion as motion_ops
-from muvo_jax.types import Array, Batch, LatentState, Observed, Variables
+from muvo_jax.types import Array, LatentState, Variables
 
 ACTION_CHANNELS = checks.ACTION_CHANNELS
 RewardFunction = Callable[[rewards.Moment], tuple[Array, Array, dict[str, Array]]]
@@ -45,6 +44,7 @@ class Environment:
       observation: "features" (model.policy_features) or "road" (agents/road.py), one vector each, or names of heads,
         decoded at full size.
       trained_steps: as many as training imagined, where that is known; `params` warns of longer episodes.
+      caution: what late rewards count, and how many branches of each step are searched for obstacles.
     """
 
     model: WorldModel
@@ -55,6 +55,7 @@ class Environment:
     reward_heads: tuple[str, ...] | None = None
     observation: Literal["features", "road"] | tuple[str, ...] = "features"
     trained_steps: int | None = None
+    caution: uncertainty.Caution = uncertainty.Caution()
 
     def __post_init__(self):
         heads = self.decoded_heads
@@ -68,6 +69,9 @@ class Environment:
             raise ValueError(f"Environment: the driving reward needs the ego path, contract.kinematics is "
                              f"{self.contract.kinematics!r}, and this run trained no head ego_motion. Train it "
                              f"(--with-heads=ego_motion), or pass a reward_function of your own.")
+        if self.caution.branches > 1 and "occupancy" not in self._reward_heads:
+            raise ValueError(f"Environment: caution.branches is {self.caution.branches}, but the reward reads no "
+                             f"occupancy in which branches could differ; expected 1, or a reward with collisions.")
         if self._reads_obstacles:
             grid, scale = self.model.config.voxels, self.reward_config.occupancy_scale
             rewards.obstacle_layers(grid.shape[2] // scale, grid, self.reward_config.box, pooled=self.pooled)
@@ -149,31 +153,7 @@ class Environment:
 
         return jax.eval_shape(example, self.model.variable_shapes())
 
-    @staticmethod
-    def starts(observed: Observed, batch: Batch, *, skip: int = 0) -> StartBank:
-        """All frames of observed windows as start states; the first `skip` of each window are left out.
-
-        Args:
-          observed: Observed [B, T, ...] of `batch`.
-          batch: with speed_mps; its route_map comes along where there is one.
-          skip: frames whose latent has seen too little yet.
-
-        Raises:
-          ValueError: if the batch has no speed, is not the one that was observed, or no frame is left.
-        """
-        if batch.speed_mps is None:
-            raise ValueError("Environment.starts: Batch.speed_mps is None; imagined drives need the speed at their "
-                             "start.")
-        seen, came = observed.states.stochastic.shape[:2], (batch.batch_size, batch.frames)
-        if seen != came:
-            raise ValueError(f"Environment.starts: the observed states are [B, T] = {list(seen)}, the batch is "
-                             f"{list(came)}; pass the batch that `observe` was given.")
-        if not 0 <= skip < batch.frames:
-            raise ValueError(f"Environment.starts: skip is {skip}, but windows have {batch.frames} frames.")
-        merge = lambda leaf: jnp.asarray(leaf[:, skip:]).reshape(-1, *leaf.shape[2:])
-        rows = jnp.repeat(jnp.arange(batch.batch_size, dtype=jnp.int32), batch.frames - skip)
-        return StartBank(jax.tree.map(merge, observed.states), merge(batch.speed_mps),
-                         None if batch.route_map is None else merge(batch.route_map), observed.memory, rows)
+    starts = staticmethod(episodes.starts)
 
     def params(self, variables: Variables, bank: StartBank, horizon: int, temperature: float = 1.0) -> EnvParams:
         """Checks and packs what the environment runs on. Warns of a horizon longer than training imagined.
@@ -195,13 +175,11 @@ class Environment:
         if not set(guessed).isdisjoint(self.decoded_heads) and (bank.memory is None or bank.row is None):
             raise ValueError(f"StartBank: it has no memory, but the heads {', '.join(guessed)} of this model look at "
                              f"what was seen of late; make it of what `observe` returned (Environment.starts).")
-        routes = None if bank.route_map is None else _follow(jnp.asarray(bank.route_map), self.reward_config.route)
-        seen, vantage = None, bank.latent.vantage
-        if self._reads_obstacles and bank.memory is not None and bank.row is not None and vantage is not None:
-            seen = _seen(bank.memory.range_view, bank.row, vantage.last, self.model.config.voxels,
-                         self.reward_config.box)
+        seen = None
+        if self._reads_obstacles:
+            seen = episodes.seen(bank, self.model.config.voxels, self.reward_config.box)
         return EnvParams(jax.tree.map(jnp.asarray, variables), bank, jnp.int32(horizon), jnp.float32(temperature),
-                         routes, seen)
+                         episodes.routes(bank, self.reward_config.route), seen)
 
     def reset(self, key: Array, params: EnvParams) -> tuple[Any, EnvState]:
         """Draws a start from the bank: (observation, state)."""
@@ -221,40 +199,50 @@ class Environment:
         decoded, coarse = self._decode(params.variables, params.bank, state.latent, state.start, self._observed_heads)
         return self._observe(state, params, decoded, coarse)
 
+    def decoded(self, state: EnvState, params: EnvParams, heads: tuple[str, ...]) -> dict[str, Array]:
+        """Full-size predictions of a state, by head."""
+        return self._decode(params.variables, params.bank, state.latent, state.start, heads)[0]
+
     def obstacles(self, state: EnvState, params: EnvParams) -> Array:
         """Probabilities [X, Y] that something stands in a column of voxels, as decoded of a state, in the car's own
         frame (rewards.obstacle_plan)."""
         _, coarse = self._decode(params.variables, params.bank, state.latent, state.start, ("occupancy",))
-        return self._plan(coarse["occupancy"])
+        return self.obstacle_plan(coarse["occupancy"])
 
     def road(self, state: EnvState, params: EnvParams, obstacles: Array) -> Array:
         """The observation "road" [road.CHANNELS] of a state with these `obstacles`."""
-        return road.observe(state.motion, route_of(params, state), obstacles, state.motion.pose,
+        return road.observe(state.motion, params.route_of(state), obstacles, state.motion.pose,
                             self.seen_ahead(params, state, state.time), grid=self.model.config.voxels,
                             config=self.reward_config, pooled=self.pooled)
 
     def step(self, key: Array, state: EnvState, action: Array, params: EnvParams) -> tuple[EnvState, Transition]:
         """One imagined step under action [2], clipped to [-1, 1]; see Transition. No auto-reset: `restart` does it."""
+        return self.advance(key, state, action, params)[:2]
+
+    def advance(self, key: Array, state: EnvState, action: Array,
+                params: EnvParams) -> tuple[EnvState, Transition, dict[str, Array]]:
+        """As `step`; beside it what the reward read, by head, the occupancy as `caution` has it."""
         forks.check("Environment.step")
         action = self._checked(action)
         checks.forward_mode("Environment.step", self.model, params.variables, state, action)
-        noise = params.temperature * jax.random.normal(key, state.latent.stochastic.shape, jnp.float32)
-        batched = jax.tree.map(lambda leaf: jnp.expand_dims(leaf, 0), (noise, state.latent, action))
-        latent, _ = self.model.imagine_step(params.variables, *batched)
-        latent = latent[0]
-        full, for_reward = self._decode(params.variables, params.bank, latent, state.start)
+        latents = self._branches(key, state.latent, action, params)
+        latent = latents[0]
+        full, coarse = self._decode(params.variables, params.bank, latent, state.start)
+        read = coarse if self.caution.branches == 1 else coarse | {
+            "occupancy": self.caution.feared(self._occupancy(params, latents, state.start))}
         motion = state.motion
         if self.ego_path == "bicycle":
             motion = motion_ops.drive(motion, action, self.contract, self.periods)
         elif self.ego_path == "ego_motion":
             motion = motion_ops.moved(motion, full["ego_motion"])
         route_map = None if params.bank.route_map is None else params.bank.route_map[state.start]
-        moment = rewards.Moment(state.motion, motion, action, latent.features, for_reward, route_map,
-                                route_of(params, state), self.seen_ahead(params, state, after_steps=state.time + 1))
+        moment = rewards.Moment(state.motion, motion, action, latent.features, read, route_map,
+                                params.route_of(state), self.seen_ahead(params, state, after_steps=state.time + 1))
         reward, terminated, terms = self._reward(moment)
+        reward = self.caution.believed(reward, state.time + 1)
         after = EnvState(latent, motion, state.start, state.time + 1, reward, terminated)
         truncated = after.time >= params.max_steps_in_episode
-        return after, Transition(self._observe(after, params, full, for_reward), reward, terminated, truncated, terms)
+        return after, Transition(self._observe(after, params, full, coarse), reward, terminated, truncated, terms), read
 
     def restart(self, key: Array, state: EnvState, observation: Any, final: Array,
                 params: EnvParams) -> tuple[EnvState, Any]:
@@ -265,19 +253,19 @@ class Environment:
 
     def occupancy_ahead(self, params: EnvParams, key: Array, state: EnvState, plan: Array) -> Array:
         """Occupancy logits [H, X, Y, Z, 2] at the reward's scale after each step of a plan [H, 2], in the frame of the
-        car of that moment. The noise is that of `play` under the same key."""
+        car of that moment, as the reward reads them. The noise is that of `play` under the same key."""
         keys = jax.vmap(lambda key: jax.random.split(key)[1])(jax.random.split(key, plan.shape[0]))
 
         def step(latent, inputs):
             key, action = inputs
-            noise = params.temperature * jax.random.normal(key, latent.stochastic.shape, jnp.float32)
-            batched = jax.tree.map(lambda leaf: jnp.expand_dims(leaf, 0), (noise, latent, self._checked(action)))
-            latent = self.model.imagine_step(params.variables, *batched)[0][0]
-            return latent, latent
+            latents = self._branches(key, latent, self._checked(action), params)
+            return latents[0], latents
 
         _, latents = jax.lax.scan(step, state.latent, (keys, plan))
-        return self._decode(params.variables, params.bank, latents, jnp.broadcast_to(state.start, plan.shape[:1]),
-                            ("occupancy",))[1]["occupancy"]
+        lead = (plan.shape[0], self.caution.branches)
+        flat = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), latents)
+        logits = self._occupancy(params, flat, state.start)
+        return self.caution.feared(jnp.moveaxis(logits.reshape(*lead, *logits.shape[1:]), 1, 0))
 
     def seen_ahead(self, params: EnvParams, state: EnvState, after_steps: Array) -> Array | None:
         """What was seen at the start and counts `after_steps` [*L] steps later: [*L, X, Y]; None without memory."""
@@ -296,6 +284,20 @@ class Environment:
         return rewards.driving_reward(moment, grid=self.model.config.voxels, contract=self.contract, step_s=self.step_s,
                                       config=self.reward_config, pooled=self.pooled)
 
+    def _branches(self, key: Array, latent: LatentState, action: Array, params: EnvParams) -> LatentState:
+        """Latents [N, ...] of `caution.branches` after one step; the first is the one in which the car goes on. The
+        others have full noise at any temperature: how far they differ is what they are drawn for."""
+        count, shape = self.caution.branches, latent.stochastic.shape
+        noise = jnp.concatenate([params.temperature * jax.random.normal(key, (1, *shape), jnp.float32),
+                                 jax.random.normal(jax.random.fold_in(key, 1), (count - 1, *shape), jnp.float32)])
+        state = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (count, *jnp.shape(leaf))), (latent, action))
+        return self.model.imagine_step(params.variables, noise, *state)[0]
+
+    def _occupancy(self, params: EnvParams, latents: LatentState, start: Array) -> Array:
+        """Occupancy logits [N, X, Y, Z, 2] of latents [N, ...] of one start, at the reward's scale."""
+        rows = jnp.broadcast_to(start, latents.stochastic.shape[:1])
+        return self._decode(params.variables, params.bank, latents, rows, ("occupancy",))[1]["occupancy"]
+
     def _decode(self, variables: Variables, bank: StartBank, latent: LatentState, start: Array,
                 heads: tuple[str, ...] | None = None):
         """(full-size predictions, predictions for the reward) of the heads; unused ones are dropped by the compiler."""
@@ -308,12 +310,13 @@ class Environment:
         return full, full if "occupancy" not in names else {
             **full, "occupancy": predictions.at_scale(self.reward_config.occupancy_scale).occupancy}
 
-    def _plan(self, occupancy: Array) -> Array:
+    def obstacle_plan(self, occupancy: Array) -> Array:
+        """rewards.obstacle_plan [X, Y] of occupancy logits at the reward's scale."""
         return rewards.obstacle_plan(occupancy, self.model.config.voxels, self.reward_config.box, pooled=self.pooled)
 
     def _observe(self, state: EnvState, params: EnvParams, decoded: dict[str, Array], coarse: dict[str, Array]) -> Any:
         if self.observation == "road":
-            return self.road(state, params, self._plan(coarse["occupancy"]))
+            return self.road(state, params, self.obstacle_plan(coarse["occupancy"]))
         return self._shown(state.latent.features, decoded)
 
     def _shown(self, features: Array, decoded: dict[str, Array]) -> Any:
@@ -323,21 +326,6 @@ class Environment:
 
     def _checked(self, action: Array) -> Array:
         return jnp.clip(checks.one_action(action, (), "Environment.step"), -1.0, 1.0)
-
-
-@functools.partial(jax.jit, static_argnames=("scale",))
-def _follow(route_maps, scale):
-    return jax.vmap(lambda route_map: route_lib.follow(route_map, scale))(route_maps)
-
-
-@functools.partial(jax.jit, static_argnames=("grid", "box"))
-def _seen(scans, row, last, grid, box):
-    return jax.lax.map(lambda which: rewards.seen_plan(scans[which[0], which[1]], grid, box), (row, last))
-
-
-def route_of(params: EnvParams, state: EnvState) -> route_lib.Route | None:
-    """The route of a state's start, or None."""
-    return None if params.routes is None else jax.tree.map(lambda leaf: leaf[state.start], params.routes)
 
 
 def play(environment: Environment, params: EnvParams, key: Array, state: EnvState, driver: Any,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from typing import Any
 
 import flax.struct
@@ -9,11 +10,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from muvo_jax import config as config_lib
+from muvo_jax.agents import rewards
 from muvo_jax.agents import route as route_lib
 from muvo_jax.model import checks
 from muvo_jax.model import memory as memory_lib
 from muvo_jax.model.world_model import WorldModel
-from muvo_jax.types import Array, LatentState, Memory, Motion, Variables
+from muvo_jax.types import Array, Batch, LatentState, Memory, Motion, Observed, Variables
 
 
 @flax.struct.dataclass
@@ -39,6 +42,32 @@ class StartBank:
         return self.speed_mps.shape[0]
 
 
+def starts(observed: Observed, batch: Batch, *, skip: int = 0) -> StartBank:
+    """All frames of observed windows as start states; the first `skip` of each window are left out.
+
+    Args:
+      observed: Observed [B, T, ...] of `batch`.
+      batch: with speed_mps; its route_map comes along where there is one.
+      skip: frames whose latent has seen too little yet.
+
+    Raises:
+      ValueError: if the batch has no speed, is not the one that was observed, or no frame is left.
+    """
+    if batch.speed_mps is None:
+        raise ValueError("Environment.starts: Batch.speed_mps is None; imagined drives need the speed at their "
+                         "start.")
+    seen, came = observed.states.stochastic.shape[:2], (batch.batch_size, batch.frames)
+    if seen != came:
+        raise ValueError(f"Environment.starts: the observed states are [B, T] = {list(seen)}, the batch is "
+                         f"{list(came)}; pass the batch that `observe` was given.")
+    if not 0 <= skip < batch.frames:
+        raise ValueError(f"Environment.starts: skip is {skip}, but windows have {batch.frames} frames.")
+    merge = lambda leaf: jnp.asarray(leaf[:, skip:]).reshape(-1, *leaf.shape[2:])
+    rows = jnp.repeat(jnp.arange(batch.batch_size, dtype=jnp.int32), batch.frames - skip)
+    return StartBank(jax.tree.map(merge, observed.states), merge(batch.speed_mps),
+                     None if batch.route_map is None else merge(batch.route_map), observed.memory, rows)
+
+
 def check(model: WorldModel, bank: StartBank) -> None:
     """Raises ValueError for a bank that this model cannot start from: of another model or recording, or empty."""
     lead = checks.state(model, bank.latent)
@@ -60,10 +89,33 @@ def check(model: WorldModel, bank: StartBank) -> None:
     for name, (index, count) in indices.items():
         if isinstance(index, jax.core.Tracer):
             continue
+        index = np.asarray(index)  # concrete where the rest is traced, too
         if jnp.shape(index) != lead or np.min(index) < 0 or np.max(index) >= count:
             raise ValueError(f"StartBank: {name} {list(jnp.shape(index))} reaches from {np.min(index)} to "
                              f"{np.max(index)}, but the memory holds {windows} windows of {frames} observations and "
                              f"there are {bank.size} starts. States and memory must come from one call of observe.")
+
+
+def routes(bank: StartBank, scale: config_lib.RouteMap) -> route_lib.Route | None:
+    """Route [M, ...], the line on each start's route map; None where there are no maps."""
+    return None if bank.route_map is None else _follow(jnp.asarray(bank.route_map), scale)
+
+
+@functools.partial(jax.jit, static_argnames=("scale",))
+def _follow(route_maps, scale):
+    return jax.vmap(lambda route_map: route_lib.follow(route_map, scale))(route_maps)
+
+
+def seen(bank: StartBank, grid: config_lib.VoxelGrid, box: rewards.EgoBox) -> Array | None:
+    """What each start's own scan showed, [M, X, Y] of rewards.seen_plan; None without memory."""
+    if bank.memory is None or bank.row is None or bank.latent.vantage is None:
+        return None
+    return _seen(bank.memory.range_view, bank.row, bank.latent.vantage.last, grid, box)
+
+
+@functools.partial(jax.jit, static_argnames=("grid", "box"))
+def _seen(scans, row, last, grid, box):
+    return jax.lax.map(lambda which: rewards.seen_plan(scans[which[0], which[1]], grid, box), (row, last))
 
 
 @flax.struct.dataclass
@@ -85,6 +137,10 @@ class EnvParams:
     temperature: Array
     routes: route_lib.Route | None = None
     seen: Array | None = None
+
+    def route_of(self, state: EnvState) -> route_lib.Route | None:
+        """The route of a state's start, or None."""
+        return None if self.routes is None else jax.tree.map(lambda leaf: leaf[state.start], self.routes)
 
 
 @flax.struct.dataclass

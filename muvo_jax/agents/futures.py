@@ -22,12 +22,14 @@ import numpy as np
 from muvo_jax.agents import environment as environment_lib
 from muvo_jax.agents import rewards, road
 from muvo_jax.agents import route as route_lib
-from muvo_jax.model import glimpse
+from muvo_jax.agents.episodes import EnvState, Transition
+from muvo_jax.model import checks, glimpse
 from muvo_jax.model import memory as memory_lib
 from muvo_jax.ops import motion as motion_ops
 from muvo_jax.types import Array, Motion
 
 SCATTERED_SHARE = 0.7  # of the starts that `scattered` moves
+_NO_LATENT: Any = None  # of a car that drives in a future imagined before
 _SCATTER = (0.0, 0.4, 0.08, 1.0)  # standard deviations: m forward, m left, rad, m/s
 
 
@@ -42,6 +44,8 @@ class Futures:
       routes: Route [N, ...], or None.
       speed_mps: float32 [N], at the start.
       reward, progress_m: float32 [N, H], what the drive that imagined earned; terminated, bool [N, H].
+      feared: float32 [N, H, X, Y], the obstacles after each step as the reward read them, where they were sought in
+        several branches (Environment.caution); None where they are those above.
     """
 
     obstacles: Array
@@ -52,6 +56,7 @@ class Futures:
     reward: Array
     progress_m: Array
     terminated: Array
+    feared: Array | None = None
 
     @property
     def count(self) -> int:
@@ -104,6 +109,7 @@ def imagine(environment: environment_lib.Environment, params: environment_lib.En
 def _imagine(environment, params, key, starts, policy, horizon):
     params = _of_starts(params, starts)
     model, bank, count = environment.model, params.bank, starts.shape[0]
+    cautious = environment.caution.branches > 1
     state = jax.vmap(environment.state_at, (0, None))(jnp.arange(count), params)
     obstacles = jax.vmap(environment.obstacles, (0, None))(state, params)
     if bank.memory is not None and memory_lib.guessed_heads(model.config):
@@ -116,17 +122,19 @@ def _imagine(environment, params, key, starts, policy, horizon):
         key_policy, key_step = jax.random.split(key)
         observation = jax.vmap(environment.road, (0, None, 0))(state, params, obstacles)
         action = jax.vmap(policy)(jax.random.split(key_policy, count), observation)
-        state, transition = jax.vmap(environment.step, (0, 0, 0, None))(jax.random.split(key_step, count), state,
-                                                                        action, params)
-        obstacles = jax.vmap(environment.obstacles, (0, None))(state, params)
+        state, transition, read = jax.vmap(environment.advance, (0, 0, 0, None))(jax.random.split(key_step, count),
+                                                                                 state, action, params)
+        obstacles = feared = jax.vmap(environment.obstacle_plan)(read["occupancy"])
+        if cautious:
+            obstacles = jax.vmap(environment.obstacles, (0, None))(state, params)
         return (state, obstacles), (obstacles, state.motion.pose, transition.reward, transition.terms["progress_m"],
-                                    transition.terminated)
+                                    transition.terminated, feared if cautious else None)
 
     _, after = jax.lax.scan(step, (state, obstacles), jax.random.split(key, horizon))
-    plans, poses, reward, progress_m, terminated = jax.tree.map(lambda leaf: jnp.swapaxes(leaf, 0, 1), after)
+    plans, poses, reward, progress_m, terminated, feared = jax.tree.map(lambda leaf: jnp.swapaxes(leaf, 0, 1), after)
     first = lambda start, rest: jnp.concatenate([start[:, None], rest], axis=1)
     return Futures(first(obstacles, plans), first(state.motion.pose, poses), params.seen, params.routes,
-                   bank.speed_mps, reward, progress_m, terminated)
+                   bank.speed_mps, reward, progress_m, terminated, feared)
 
 
 def _of_starts(params, starts):
@@ -143,15 +151,63 @@ def _of_starts(params, starts):
                                seen=jax.tree.map(pick, params.seen))
 
 
-def scattered(key: Array, futures: Futures) -> Motion:
-    """Motion [N] to start from: that of each future, most of them moved in their lane, turned and at another speed.
+def scattered(key: Array, speed_mps: Array) -> Motion:
+    """Motion [N] to start from, at recorded speeds [N]: most of them moved in their lane, turned and at another speed.
 
     A recording knows a car that is where it should be; an agent must also come back.
     """
     key_moved, key_which = jax.random.split(key)
-    moved = jnp.asarray([_SCATTER], jnp.float32) * jax.random.normal(key_moved, (futures.count, 4), jnp.float32)
-    moved = jnp.where(jax.random.uniform(key_which, (futures.count, 1)) < SCATTERED_SHARE, moved, 0.0)
-    return Motion(moved[:, :3], jnp.maximum(futures.speed_mps + moved[:, 3], 0.0))
+    count = speed_mps.shape[0]
+    moved = jnp.asarray([_SCATTER], jnp.float32) * jax.random.normal(key_moved, (count, 4), jnp.float32)
+    moved = jnp.where(jax.random.uniform(key_which, (count, 1)) < SCATTERED_SHARE, moved, 0.0)
+    return Motion(moved[:, :3], jnp.maximum(speed_mps + moved[:, 3], 0.0))
+
+
+@flax.struct.dataclass
+class Around:
+    """What is around a car in its future after some steps, leading axes any: see Futures."""
+
+    obstacles: Array
+    feared: Array
+    pose: Array
+    seen: Array | None
+    route: route_lib.Route | None
+
+
+def around(environment: environment_lib.Environment, futures: Futures, index: Any, step: Array) -> Around:
+    """What is around the cars in the futures `index`, an integer or a slice, `step` steps after their start."""
+    obstacles = futures.obstacles[index, step]
+    feared = obstacles if futures.feared is None else futures.feared[index, jnp.maximum(step - 1, 0)]
+    seen = None if futures.seen is None else jnp.where(environment.holds_seen(step), futures.seen[index], 0.0)
+    return Around(obstacles, feared, futures.pose[index, step], seen,
+                  jax.tree.map(lambda leaf: leaf[index], futures.routes))
+
+
+def look(environment: environment_lib.Environment, here: Around, motion: Motion) -> Array:
+    """The observation [CHANNELS] of one car."""
+    return road.observe(motion, here.route, here.obstacles, here.pose, here.seen, grid=environment.model.config.voxels,
+                        config=environment.reward_config, pooled=environment.pooled)
+
+
+def advance(environment: environment_lib.Environment, there: Around, motion: Motion, action: Array,
+            step: Array) -> tuple[Motion, Array, Array, dict[str, Array]]:
+    """One car drives one step on the bicycle's path, its step-th: Motion, reward, terminated and the reward's terms.
+
+    there: around it after the step.
+    """
+    config, grid, touched = environment.reward_config, environment.model.config.voxels, None
+    after = motion_ops.drive(motion, action, environment.contract, environment.periods)
+    if config.collision:
+        places = rewards.poses_ahead(after.pose, motion, after, config.ahead_s)
+        touched = rewards.box_collision(there.feared, motion_ops.relative(places, there.pose[None]), grid, config.box,
+                                        pooled=environment.pooled)
+        if there.seen is not None:
+            touched = jnp.maximum(touched, rewards.box_collision(there.seen, places, grid, config.box))
+        touched = touched.max()
+    moment = rewards.Moment(motion, after, action, motion.speed_mps, {}, route=there.route)
+    reward, terminated, terms = rewards.weighed(moment, touched, contract=environment.contract,
+                                                step_s=environment.step_s, config=config)
+    return after, environment.caution.believed(reward, step), terminated, terms
 
 
 # (observation [N, CHANNELS], step) -> (actions [N, 2] in [-1, 1], anything)
@@ -169,35 +225,72 @@ def drive(environment: environment_lib.Environment, futures: Futures, start: Mot
       observations [H + 1, N, CHANNELS], rewards [H, N], terminated bool [H, N], and what `act` returned beside the
       actions, [H, N, ...].
     """
-    config, contract, periods = environment.reward_config, environment.contract, environment.periods
-    grid, pooled = environment.model.config.voxels, environment.pooled
-
-    def observe(motion, step):
-        look = functools.partial(road.observe, grid=grid, config=config, pooled=pooled)
-        return jax.vmap(look)(motion, futures.routes, futures.obstacles[:, step], futures.pose[:, step], _seen(step))
-
-    def _seen(step):
-        return None if futures.seen is None else jnp.where(environment.holds_seen(step), futures.seen, 0.0)
-
-    def touched(before, after, obstacles, pose, seen):
-        places = rewards.poses_ahead(after.pose, before, after, config.ahead_s)
-        found = rewards.box_collision(obstacles, motion_ops.relative(places, pose[None]), grid, config.box,
-                                      pooled=pooled)
-        if seen is not None:
-            found = jnp.maximum(found, rewards.box_collision(seen, places, grid, config.box))
-        return found.max()
+    surroundings = lambda step: around(environment, futures, slice(None), step)
+    observe = lambda motion, step: jax.vmap(functools.partial(look, environment))(surroundings(step), motion)
 
     def step(motion, index):
         observation = observe(motion, index)
         action, extra = act(observation, index)
-        after = motion_ops.drive(motion, action, contract, periods)
-        collision = jax.vmap(touched)(motion, after, futures.obstacles[:, index + 1], futures.pose[:, index + 1],
-                                    _seen(index + 1)) if config.collision else None
-        moment = rewards.Moment(motion, after, action, motion.speed_mps, {}, route=futures.routes)
-        weighed = lambda moment, collision: rewards.weighed(moment, collision, contract=contract,
-                                                            step_s=environment.step_s, config=config)
-        reward, terminated, _ = jax.vmap(weighed)(moment, collision)
+        after, reward, terminated, _ = jax.vmap(functools.partial(advance, environment), (0, 0, 0, None))(
+            surroundings(index + 1), motion, action, index + 1)
         return after, (observation, reward, terminated, extra)
 
     last, (observed, reward, terminated, extra) = jax.lax.scan(step, start, jnp.arange(futures.horizon))
     return jnp.concatenate([observed, observe(last, futures.horizon)[None]]), reward, terminated, extra
+
+
+@flax.struct.dataclass
+class FuturesParams:
+    """What SharedFutures runs on: the futures, and as many steps as they have, int32."""
+
+    futures: Futures
+    max_steps_in_episode: Array
+
+
+@dataclasses.dataclass(frozen=True)
+class SharedFutures:
+    """Imagined futures as an environment for the doors to other libraries, with the functions of Environment: a step is
+    one of `drive`'s, and starts are scattered.
+
+    Attributes:
+      environment: in which they were imagined.
+    """
+
+    environment: environment_lib.Environment
+
+    def __post_init__(self):
+        check(self.environment)
+
+    def params(self, futures: Futures) -> FuturesParams:
+        """Packs what the environment runs on."""
+        return FuturesParams(futures, jnp.int32(futures.horizon))
+
+    @property
+    def observation_shapes(self) -> jax.ShapeDtypeStruct:
+        return self.environment.observation_shapes
+
+    @property
+    def step_s(self) -> float:
+        return self.environment.step_s
+
+    def reset(self, key: Array, params: FuturesParams) -> tuple[Array, EnvState]:
+        """Draws a future: (observation, state); the state has no latent."""
+        key_which, key_start = jax.random.split(key)
+        start = jax.random.randint(key_which, (), 0, params.futures.count, jnp.int32)
+        motion = jax.tree.map(lambda leaf: leaf[0], scattered(key_start, params.futures.speed_mps[start][None]))
+        state = EnvState(_NO_LATENT, motion, start, jnp.int32(0), jnp.float32(0), jnp.bool_(False))
+        return self.observe(state, params), state
+
+    def observe(self, state: EnvState, params: FuturesParams) -> Array:
+        """The observation "road" of a state."""
+        return look(self.environment, around(self.environment, params.futures, state.start, state.time), state.motion)
+
+    def step(self, key: Array, state: EnvState, action: Array, params: FuturesParams) -> tuple[EnvState, Transition]:
+        """One step under action [2], clipped to [-1, 1]; it draws nothing."""
+        del key
+        action = jnp.clip(checks.one_action(action, (), "SharedFutures.step"), -1.0, 1.0)
+        there = around(self.environment, params.futures, state.start, state.time + 1)
+        motion, reward, terminated, terms = advance(self.environment, there, state.motion, action, state.time + 1)
+        after = EnvState(_NO_LATENT, motion, state.start, state.time + 1, reward, terminated)
+        return after, Transition(look(self.environment, there, motion), reward, terminated,
+                                 after.time >= params.max_steps_in_episode, terms)

@@ -192,9 +192,10 @@ def shared_future_returns(environment: environment_lib.Environment, params: envi
         if environment.reward_config.collision:
             touched = _touched(environment, params, jax.random.split(key, 1)[0], state, plans[0], before, after)
         moment = rewards.Moment(before, after, plans, state.latent.features, {},
-                                route=environment_lib.route_of(params, state))
+                                route=params.route_of(state))
         reward, terminated, _ = rewards.weighed(moment, touched, contract=environment.contract,
                                                 step_s=environment.step_s, config=environment.reward_config)
+        reward = environment.caution.believed(reward, state.time + 1 + jnp.arange(plans.shape[1]))
         return jax.vmap(lambda reward, ended: _discounted(reward, ended, discount))(reward, terminated)
 
     return returns

@@ -5,13 +5,57 @@ All are pure functions of arrays; N is the axis of branches.
 
 from __future__ import annotations
 
+import dataclasses
+from typing import Annotated
+
 import flax.struct
 import jax
 import jax.numpy as jnp
+import numpy as np
 
+from muvo_jax import limits
+from muvo_jax.limits import COUNT, SHARE
 from muvo_jax.types import OCCUPANCY_OCCUPIED, OCCUPANCY_UNKNOWN, Array
 
 _TINY = 1e-12
+
+
+@dataclasses.dataclass(frozen=True)
+class Caution:
+    """How an agent takes what is imagined for it; by default as it comes.
+
+    Attributes:
+      trust: what a reward earned after 1, 2, ... imagined steps counts, each in [0, 1], such as `trust` says; later
+        ones count as the last. Where it is empty all count in full.
+      branches: latents drawn in each step. The car goes on in the first; obstacles are sought in all of them.
+      quantile: of the branches' probabilities that a voxel is occupied, which then is taken as its probability; 1 is
+        the most pessimistic branch, 0.5 their median.
+    """
+
+    trust: tuple[float, ...] = ()
+    branches: Annotated[int, COUNT] = 1
+    quantile: Annotated[float, SHARE] = 1.0
+
+    def __post_init__(self):
+        limits.check(self)
+        object.__setattr__(self, "trust", tuple(float(share) for share in self.trust))
+        if not all(0.0 <= share <= 1.0 for share in self.trust):
+            raise ValueError(f"Caution: trust is {list(self.trust)}; expected a share in [0, 1] for each step, as "
+                             f"python -m muvo_jax.evaluate RUN --uncertainty=8 measures.")
+
+    def believed(self, reward: Array, step: Array) -> Array:
+        """What rewards [..., *L] earned by the step-th imagined step count, step int32 [*L] from 1 on."""
+        if not self.trust:
+            return reward
+        share = jnp.asarray(np.array(self.trust, np.float32))
+        return reward * jnp.broadcast_to(share[jnp.clip(step - 1, 0, share.size - 1)], reward.shape)
+
+    def feared(self, logits: Array) -> Array:
+        """Occupancy logits [..., 2] whose probability is the quantile of that of the branches [N, ..., 2]."""
+        if logits.shape[0] == 1:
+            return logits[0]
+        occupied = jnp.quantile((logits[..., 1] - logits[..., 0]).astype(jnp.float32), self.quantile, axis=0)
+        return jnp.stack([jnp.zeros_like(occupied), occupied], axis=-1)
 
 
 @flax.struct.dataclass

@@ -2,23 +2,26 @@
 
 import copy
 import dataclasses
+import math
+import pickle
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from worlds import HORIZON, MODEL, make, variables
+from worlds import HORIZON, MODEL, NO_COLLISION, make, variables, with_memory
 
+from muvo_jax.agents import environment as environment_lib
 from muvo_jax.agents.doors import dreamer, optional
 
 ACTION = jnp.array([0.5, -0.2])
 
 
 class GymnaxDoor:
-    def __init__(self):
+    def __init__(self, made=None):
         pytest.importorskip("gymnax", reason="gymnax is not installed")
         from muvo_jax.agents.doors import gymnax_env
-        core, self.params = make()
+        core, self.params = made or make()
         self.env = gymnax_env.GymnaxImagination(core, self.params)
 
     def start(self, key):
@@ -32,12 +35,15 @@ class GymnaxDoor:
         observation, state, reward, terminated, truncated, info = self.env.step(key_step, state, action, self.params)
         return (observation, info["final_observation"], reward, terminated, truncated), (key, state)
 
+    def spaces(self):
+        return {name: space.shape for name, space in self.env.observation_space().spaces.items()}
+
 
 class BraxDoor:
-    def __init__(self):
+    def __init__(self, made=None):
         pytest.importorskip("brax", reason="brax is not installed")
         from muvo_jax.agents.doors import brax_env
-        core, params = make()
+        core, params = made or make()
         self.env = brax_env.BraxImagination(core, params)
 
     def start(self, key):
@@ -48,12 +54,15 @@ class BraxDoor:
         state = self.env.step(carry, action)
         return (state.obs, state.obs, state.reward, state.done > 0, state.info["truncation"] > 0), state
 
+    def spaces(self):
+        return self.env.observation_size
+
 
 class StoaDoor:
-    def __init__(self):
+    def __init__(self, made=None):
         pytest.importorskip("stoa", reason="stoa-env is not installed")
         from muvo_jax.agents.doors import stoa_env
-        core, params = make()
+        core, params = made or make()
         self.env = stoa_env.StoaImagination(core, params)
 
     def start(self, key):
@@ -65,6 +74,9 @@ class StoaDoor:
         state, timestep = self.env.step(carry, action)
         return (timestep.observation, timestep.observation, timestep.reward, timestep.terminated(),
                 timestep.truncated()), state
+
+    def spaces(self):
+        return {name: space.shape for name, space in self.env.observation_space().spaces.items()}
 
 
 DOORS = {"gymnax": GymnaxDoor, "brax": BraxDoor, "stoa": StoaDoor}
@@ -137,31 +149,93 @@ def test_brax_wrappers_truncate_and_reset():
     np.testing.assert_allclose(state.obs, state.info["first_obs"])
 
 
-def test_brax_shows_decoded_sensors_by_head_and_its_state_holds_no_memory():
-    pytest.importorskip("brax", reason="brax is not installed")
-    from muvo_jax.agents.doors import brax_env
-    core, params = make(observation=("image", "range_view"))
-    env = brax_env.BraxImagination(core, params)
-    start = jax.eval_shape(env.reset, jax.random.PRNGKey(0))
-    after = jax.eval_shape(env.step, start, ACTION)
-    for state in (start, after):
-        assert {name: leaf.shape for name, leaf in state.obs.items()} == env.observation_size
-    assert env.observation_size["image"] == (*MODEL.config.image_size, 3)
-    assert jax.tree.structure(start) == jax.tree.structure(after)
-    held = sum(leaf.size for leaf in jax.tree.leaves(start.pipeline_state))
-    assert held < 2 * MODEL.feature_shape[0] + 20  # the latent and the car, no weights, memory or bank
+@pytest.mark.parametrize("name", DOORS)
+def test_decoded_sensors_come_by_head_and_no_state_holds_or_gathers_memory(name):
+    """Of a model that remembers what was seen; nothing is computed, shapes are all."""
+    model, starts, _ = with_memory(heads=("image", "range_view", "action"))
+    core = environment_lib.Environment(model, periods=2, reward_config=NO_COLLISION,
+                                       observation=("image", "range_view"))
+
+    def drive(variables):
+        door = DOORS[name]((core, core.params(variables, starts, HORIZON)))
+        observation, first = door.start(raw_or_typed(door, 0))
+        (following, *_), second = door.step(first, ACTION)
+        assert {head: leaf.shape for head, leaf in observation.items()} == door.spaces()
+        return observation, following, first, second
+
+    observation, following, first, second = jax.eval_shape(drive, model.variable_shapes())
+    shapes = lambda tree: jax.tree.map(lambda leaf: (leaf.shape, leaf.dtype), tree)
+    assert observation["image"].shape == (*model.config.image_size, 3)
+    assert shapes(first) == shapes(second) and shapes(observation) == shapes(following)
+    numbers = lambda tree: sum(math.prod(leaf.shape) for leaf in jax.tree.leaves(tree))
+    latent = numbers(model.initial_state(1))
+    assert numbers(starts.memory) > 10 * (latent + 40)
+    # the latent, the car, key and terms, and in brax's state the observation; no weights, memory or bank
+    assert numbers(first) <= latent + 40 + (numbers(observation) if name == "brax" else 0)
 
 
-def test_a_gymnasium_environment_copied_mid_drive_goes_on_alike():
+@pytest.fixture(scope="module")
+def of_sensors():
+    """A Gymnasium environment that observes decoded sensors and renders."""
     pytest.importorskip("gymnasium", reason="gymnasium is not installed")
     from muvo_jax.agents.doors import gymnasium_env
-    env = gymnasium_env.GymnasiumImagination(*make())
-    env.reset(seed=1)
-    env.step(np.array(ACTION))
-    twin = copy.deepcopy(env)
-    (seen, reward, *_), (other, other_reward, *_) = env.step(np.array(ACTION)), twin.step(np.array(ACTION))
-    np.testing.assert_allclose(seen, other, atol=1e-6)
-    assert reward == pytest.approx(other_reward) and env.observation_space.contains(seen)
+    return gymnasium_env.GymnasiumImagination(*make(observation=("image", "range_view")), render_mode="rgb_array")
+
+
+def same(seen, other):
+    return all(np.array_equal(seen[head], other[head]) for head in seen)
+
+
+def test_gymnasium_agrees_with_its_own_checker(of_sensors):
+    from gymnasium.utils import env_checker
+    env_checker.check_env(of_sensors)
+    of_sensors.reset(seed=3)
+    ends = [of_sensors.step(np.array(ACTION))[2:4] for _ in range(HORIZON)]
+    assert ends == [(False, False), (False, False), (False, True)]
+
+
+def test_a_gymnasium_drive_depends_on_its_seed_alone(of_sensors):
+    def drive(seed):
+        first, _ = of_sensors.reset(seed=seed)
+        return first, of_sensors.step(np.array(ACTION))[0]
+
+    (first, second), (again, after), others = drive(3), drive(3), [drive(seed)[1] for seed in range(4)]
+    assert same(first, again) and same(second, after)
+    assert any(not same(second, other) for other in others)
+
+
+def test_a_gymnasium_space_holds_whatever_is_observed(of_sensors):
+    space, actions = of_sensors.observation_space, np.random.default_rng(0).uniform(-1.5, 1.5, (40, 2))
+    for index, action in enumerate(actions):
+        if index % HORIZON == 0:
+            assert space.contains(of_sensors.reset(seed=index)[0])
+        assert space.contains(of_sensors.step(action)[0])
+    assert {head: leaf.shape for head, leaf in space.items()}["image"] == (*MODEL.config.image_size, 3)
+
+
+def test_gymnasium_renders_the_decoded_camera(of_sensors):
+    observation, _ = of_sensors.reset(seed=1)
+    picture = of_sensors.render()
+    assert picture.dtype == np.uint8
+    np.testing.assert_allclose(picture, 255 * np.clip(observation["image"], 0, 1), atol=0.51)
+    from muvo_jax.agents.doors import gymnasium_env
+    core, params = make()
+    assert gymnasium_env.GymnasiumImagination(core, params).render() is None
+    with pytest.raises(ValueError, match=r"render_mode is 'human'; expected 'rgb_array' or None"):
+        gymnasium_env.GymnasiumImagination(core, params, render_mode="human")
+    blind = dataclasses.replace(core, model=with_memory()[0])
+    with pytest.raises(ValueError, match=r"this run trained occupancy, action\. Train the head \(--with-heads=image"):
+        gymnasium_env.GymnasiumImagination(blind, params, render_mode="rgb_array")
+
+
+@pytest.mark.parametrize("copied", [copy.deepcopy, lambda env: pickle.loads(pickle.dumps(env))])
+def test_a_gymnasium_environment_copied_mid_drive_goes_on_alike(of_sensors, copied):
+    of_sensors.reset(seed=1)
+    of_sensors.step(np.array(ACTION))
+    twin = copied(of_sensors)
+    (seen, reward, *_), (other, other_reward, *_) = of_sensors.step(np.array(ACTION)), twin.step(np.array(ACTION))
+    assert same(seen, other) and reward == other_reward
+    np.testing.assert_array_equal(of_sensors.render(), twin.render())
 
 
 def test_stoa_wrappers_reset_and_keep_the_final_observation():
@@ -177,26 +251,16 @@ def test_stoa_wrappers_reset_and_keep_the_final_observation():
     env.environment_space()
 
 
-def test_gymnasium_agrees_with_its_own_checker():
-    pytest.importorskip("gymnasium", reason="gymnasium is not installed")
-    from gymnasium.utils import env_checker
-
-    from muvo_jax.agents.doors import gymnasium_env
-    env = gymnasium_env.GymnasiumImagination(*make())
-    env_checker.check_env(env, skip_render_check=True)
-    first, _ = env.reset(seed=3)
-    ends = [env.step(np.array(ACTION))[2:4] for _ in range(HORIZON)]
-    assert ends == [(False, False), (False, False), (False, True)]
-    np.testing.assert_array_equal(env.reset(seed=3)[0], first)
-
-
 def test_the_functional_environment_runs_in_gymnasiums_wrapper():
     pytest.importorskip("gymnasium", reason="gymnasium is not installed")
     from gymnasium.envs.functional_jax_env import FunctionalJaxEnv
 
     from muvo_jax.agents.doors import gymnasium_env
-    env = FunctionalJaxEnv(gymnasium_env.FunctionalImagination(*make()), metadata={"render_modes": []})
+    env = FunctionalJaxEnv(gymnasium_env.FunctionalImagination(*make()), metadata={"render_modes": ["rgb_array"]},
+                           render_mode="rgb_array")
     observation, _ = env.reset(seed=0)
+    assert env.render().shape == (*MODEL.config.image_size, 3)
+    env.close()
     following, reward, terminated, truncated, _ = env.step(ACTION)
     assert observation.shape == following.shape == (MODEL.policy_feature_channels,)
     assert np.isfinite(reward) and not terminated and not truncated

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from worlds import CONFIG, HORIZON, MODEL, NO_COLLISION, STARTS, bank, make, variables
+from worlds import CONFIG, HORIZON, MODEL, NO_COLLISION, STARTS, bank, make, variables, with_memory
 
 from muvo_jax import config as config_lib
 from muvo_jax import presets
@@ -15,7 +15,6 @@ from muvo_jax import run as run_lib
 from muvo_jax.agents import environment as environment_lib
 from muvo_jax.agents import episodes, rewards
 from muvo_jax.model import checks, rollout, world_model
-from muvo_jax.model import memory as memory_lib
 from muvo_jax.types import Batch, Observed
 
 ACTION = jnp.array([0.5, -0.2])
@@ -139,16 +138,6 @@ def test_what_does_not_fit_is_refused():
     none = dataclasses.replace(environment.contract, kinematics="none")
     with pytest.raises(ValueError, match="or pass a reward_function"):
         dataclasses.replace(environment, contract=none)
-
-
-def with_memory(windows=2, starts=STARTS):
-    """A model with a memory, and a bank of states that were observed in windows of four frames."""
-    model = world_model.WorldModel(config_lib.override_all(presets.get("tiny"), {
-        "model.first_guess": "last_seen", "model.heads": ("occupancy", "action")}).model)
-    latent, places = model.initial_state(starts), memory_lib.stream_places(model.config)
-    rows = jnp.arange(starts, dtype=jnp.int32) % windows
-    return model, environment_lib.StartBank(latent, jnp.ones(starts), bank().route_map[:starts], memory_lib.empty(
-        model.config, windows), rows), places
 
 
 def test_a_bank_of_another_recording_is_refused():

@@ -58,6 +58,39 @@ def test_the_first_drive_is_that_of_the_environment(imagined, driven):
     np.testing.assert_allclose(seen[:, :, 0], 0.6, rtol=1e-6)  # speed / 10 m/s
 
 
+def test_futures_are_an_environment_of_their_own(imagined):
+    world, _, futures = imagined
+    shared = futures_lib.SharedFutures(world)
+    params = shared.params(futures)
+    observation, state = jax.jit(shared.reset)(jax.random.key(0), params)
+    assert observation.shape == shared.observation_shapes.shape == (road.CHANNELS,)
+    state = dataclasses.replace(state, motion=Motion(jnp.zeros(3), futures.speed_mps[1]), start=jnp.int32(1))
+    drive = lambda state: jax.lax.scan(lambda state, _: shared.step(None, state, jnp.zeros(2), params), state, None,
+                                       length=HORIZON)
+    _, transitions = jax.jit(drive)(state)
+    np.testing.assert_allclose(transitions.reward, futures.reward[1], atol=2e-4)
+    np.testing.assert_array_equal(transitions.terminated, futures.terminated[1])
+    assert transitions.truncated.tolist() == [False] * (HORIZON - 1) + [True]
+    with pytest.raises(ValueError, match=r"SharedFutures.step: 1 values of the actions"):
+        shared.step(None, state, np.array([0.0, np.nan]), params)
+
+
+def test_futures_go_through_a_door(imagined):
+    pytest.importorskip("gymnax", reason="gymnax is not installed")
+    from muvo_jax.agents.doors import gymnax_env
+    world, _, futures = imagined
+    shared = futures_lib.SharedFutures(world)
+    door = gymnax_env.GymnaxImagination(shared, shared.params(futures))
+
+    def drive(key):
+        seen, state = door.reset(key, door.default_params)
+        return seen, state, *door.step(key, state, jnp.zeros(2), door.default_params)
+
+    seen, first, after, second, *_ = jax.eval_shape(drive, jax.random.key(0))
+    assert seen == after and jax.tree.map(jnp.shape, first) == jax.tree.map(jnp.shape, second)
+    assert sum(leaf.size for leaf in jax.tree.leaves(first)) < 20  # where the car is; no map
+
+
 def test_a_future_has_a_derivative_in_the_actions(driven):
     """At 2 m/s nothing is near in 2 s: accelerating earns more, sooner most, steering off the route less."""
     _, slope = driven(jnp.full((HORIZON, 2, 2), 0.01, jnp.float32), jnp.full((2,), 2.0, jnp.float32))

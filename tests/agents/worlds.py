@@ -7,9 +7,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from muvo_jax import config as config_lib
 from muvo_jax import presets
 from muvo_jax.agents import environment as environment_lib
 from muvo_jax.agents import rewards
+from muvo_jax.model import memory as memory_lib
 from muvo_jax.model import world_model
 from muvo_jax.types import Gaussian, LatentState, Predictions
 
@@ -37,6 +39,16 @@ def make(horizon=HORIZON, **options):
     """(environment, params); without occupancy in the reward unless asked otherwise, since decoding compiles long."""
     environment = environment_lib.Environment(MODEL, periods=2, **{"reward_config": NO_COLLISION} | options)
     return environment, environment.params(variables(), bank(), horizon)
+
+
+def with_memory(windows=2, starts=STARTS, heads=("occupancy", "action")):
+    """A model with a memory, a bank of states that were observed in as many windows, and the places of a window."""
+    model = world_model.WorldModel(config_lib.override_all(presets.get("tiny"), {
+        "model.first_guess": "last_seen", "model.heads": heads}).model)
+    latent, places = model.initial_state(starts), memory_lib.stream_places(model.config)
+    rows = jnp.arange(starts, dtype=jnp.int32) % windows
+    return model, environment_lib.StartBank(latent, jnp.ones(starts), bank().route_map[:starts], memory_lib.empty(
+        model.config, windows), rows), places
 
 
 @dataclasses.dataclass(frozen=True)

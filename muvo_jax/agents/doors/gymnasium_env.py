@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from typing import Any
 
 import jax
@@ -15,6 +16,7 @@ from muvo_jax.agents.doors import optional
 gymnasium: Any = optional.need("gymnasium", "gymnasium")
 Functional: Any = optional.need("gymnasium.experimental.functional", "gymnasium").FuncEnv
 Env: Any = gymnasium.Env
+RENDER_MODES = ("rgb_array",)
 
 
 class FunctionalImagination(Functional):
@@ -48,40 +50,50 @@ class FunctionalImagination(Functional):
         del rng, params
         return state.terminated
 
+    def render_init(self, params=None, **kwargs):
+        del params, kwargs
+        _check_rendered(self.core, "rgb_array")
+        return ()
+
+    def render_image(self, state, render_state, params=None):
+        return render_state, camera_picture(self.core, self._or_default(params), state)
+
+    def render_close(self, render_state, params=None):
+        del render_state, params
+
     def _or_default(self, params):
         return self.default_params if params is None else params
 
 
 class GymnasiumImagination(Env):
-    """The core as a gymnasium.Env: NumPy in and out, one compiled step. Truncated at the horizon; does not restart."""
+    """The core as a gymnasium.Env: NumPy in and out, one compiled step. Truncated at the horizon; does not restart.
 
-    metadata: dict[str, Any] = {"render_modes": []}  # noqa: RUF012 (gymnasium's own form)
-    render_mode = None
+    With render_mode="rgb_array", `render` gives the camera image that the model decodes: uint8 [H, W, 3].
+    """
 
-    def __init__(self, core: environment_lib.Environment, params: environment_lib.EnvParams):
-        self.core = core
+    metadata: dict[str, Any] = {"render_modes": list(RENDER_MODES)}  # noqa: RUF012 (gymnasium's own form)
+
+    def __init__(self, core: environment_lib.Environment, params: environment_lib.EnvParams,
+                 render_mode: str | None = None):
+        _check_rendered(core, render_mode)
+        self.core, self.render_mode = core, render_mode
+        self.metadata = self.metadata | {"render_fps": 1.0 / core.step_s}
         self.params = params
         self.observation_space, self.action_space = observation_space(core), action_space()
-        self._compile()
         self._state: environment_lib.EnvState | None = None
 
-    def _compile(self):
-        self._reset, self._step = jax.jit(self.core.reset), jax.jit(self.core.step)
-
     def __getstate__(self):
-        """For processes that spawn: compiled functions are made anew there, arrays travel as NumPy's."""
-        kept = {name: value for name, value in vars(self).items() if name not in ("_reset", "_step")}
-        return kept | {"params": jax.device_get(self.params), "_state": jax.device_get(self._state)}
+        """For processes that spawn: arrays travel as NumPy's."""
+        return vars(self) | {"params": jax.device_get(self.params), "_state": jax.device_get(self._state)}
 
     def __setstate__(self, kept):
         self.__dict__.update(kept)
         self.params = jax.tree.map(jnp.asarray, self.params)
-        self._compile()
 
     def reset(self, *, seed=None, options=None):
         forks.check("GymnasiumImagination.reset")
         super().reset(seed=seed, options=options)
-        observation, self._state = self._reset(self._key(), self.params)
+        observation, self._state = _reset(self.core, self._key(), self.params)
         return jax.device_get(observation), {}
 
     def step(self, action):
@@ -92,14 +104,52 @@ class GymnasiumImagination(Env):
         if not np.isfinite(action).all():  # what is outside [-1, 1] is clipped
             raise ValueError(f"GymnasiumImagination.step: at step {int(self._state.time)} of the episode the action is "
                              f"{action.tolist()}; expected two finite numbers in [-1, 1] (acceleration, steering).")
-        self._state, transition = self._step(self._key(), self._state, action, self.params)
+        self._state, transition = _step(self.core, self._key(), self._state, action, self.params)
         transition = jax.device_get(transition)
         info = {name: float(value) for name, value in transition.terms.items()}
         return (transition.observation, float(transition.reward), bool(transition.terminated),
                 bool(transition.truncated), info)
 
+    def render(self):
+        if self.render_mode is None:
+            return None
+        if self._state is None:
+            raise ValueError("GymnasiumImagination.render before reset.")
+        return camera_picture(self.core, self.params, self._state)
+
     def _key(self):
         return jax.random.key(int(self.np_random.integers(2**31)))
+
+
+# Compiled once for all environments alike, copies included.
+@functools.partial(jax.jit, static_argnames=("core",))
+def _reset(core, key, params):
+    return core.reset(key, params)
+
+
+@functools.partial(jax.jit, static_argnames=("core",))
+def _step(core, key, state, action, params):
+    return core.step(key, state, action, params)
+
+
+@functools.partial(jax.jit, static_argnames=("core",))
+def _camera(core, params, state):
+    image = core.decoded(state, params, ("image",))["image"]
+    return jnp.round(255.0 * jnp.clip(image, 0.0, 1.0)).astype(jnp.uint8)
+
+
+def camera_picture(core: environment_lib.Environment, params: environment_lib.EnvParams,
+                   state: environment_lib.EnvState) -> np.ndarray:
+    """The camera image that the model decodes of a state: uint8 [H, W, 3]."""
+    return np.asarray(_camera(core, params, state))
+
+
+def _check_rendered(core, render_mode):
+    if render_mode is not None and render_mode not in RENDER_MODES:
+        raise ValueError(f"render_mode is {render_mode!r}; expected {' or '.join(map(repr, RENDER_MODES))} or None.")
+    if render_mode is not None and "image" not in core.model.config.heads:
+        raise ValueError(f"render_mode={render_mode!r} shows the decoded camera image, but this run trained "
+                         f"{', '.join(core.model.config.heads)}. Train the head (--with-heads=image), or pass None.")
 
 
 def action_space():

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import pathlib
 import sys
+from collections.abc import Mapping, Sequence
 from typing import Annotated
 
 import numpy as np
@@ -22,7 +23,7 @@ with late.imports():
     from muvo_jax.metrics import baselines, protocol, warp
     from muvo_jax.model import rollout, world_model
     from muvo_jax.training import screen
-    from muvo_jax.viz import sheets
+    from muvo_jax.viz import page, rerun_log, sheets
 
 MOST_COLUMNS = 3  # predictions beside the truth in one animation
 
@@ -31,7 +32,8 @@ MOST_COLUMNS = 3  # predictions beside the truth in one animation
 class Options:
     """Observes the first frames of a recorded sequence, imagines the rest under its actions, and draws both.
 
-    Writes an animation (GIF) and two sheets (PNG): camera and range image; points and voxels in space.
+    Writes an animation (GIF), two sheets (PNG) of camera and range image and of points and voxels in space, and a page
+    (HTML) with sliders over time and futures, which any browser opens.
     """
 
     run: Annotated[pathlib.Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
@@ -54,22 +56,30 @@ class Options:
     """Futures to sample; 1 takes the mean of each latent."""
     seed: int = 0
     """Of the sampled futures."""
+    moments: int = 8
+    """At most so many frames on the sheets, evenly spread, the last one included."""
     out: Annotated[pathlib.Path | None, command_line.shown("PATH", "RUN/dreams")] = None
     """Where to write."""
+    rerun: Annotated[pathlib.Path | None, command_line.shown("FILE.rrd", "none")] = None
+    """Also log camera, points, voxels, path and actions for the Rerun viewer (extra [viz])."""
 
 
 EXAMPLES = """
 python -m muvo_jax.dream runs/town-tr
 python -m muvo_jax.dream runs/town-tr --split=val_ds --start=30 --horizon=12
 python -m muvo_jax.dream runs/town-tr --branches=3  (three sampled futures)
+python -m muvo_jax.dream builtin:town --rerun=dream.rrd && rerun dream.rrd
 """
 
 
 def dream(options: Options, show: screen.Screen) -> list[pathlib.Path]:
     """Does what the command line asks for; returns the files written."""
     loaded = command_line.load_run(options.run, options.checkpoint, show)
-    if options.branches < 1:
-        raise ValueError(f"--branches is {options.branches}; it must be at least 1.")
+    if options.rerun:
+        rerun_log.check(options.rerun)
+    for flag, value in (("branches", options.branches), ("moments", options.moments)):
+        if value < 1:
+            raise ValueError(f"--{flag} is {value}; it must be at least 1.")
     fields = {"data": "data.path", "context": "data.context", "horizon": "data.horizon"}
     chosen = command_line.chosen_settings(options, fields)
     config = config_lib.override_all(loaded.config, chosen)
@@ -80,16 +90,31 @@ def dream(options: Options, show: screen.Screen) -> list[pathlib.Path]:
     futures = dream_window(world_model.WorldModel(config.model), loaded.variables, jax.random.key(options.seed), batch,
                            context=config.data.context, horizon=config.data.horizon, branches=options.branches)
     labels = ["world model"] if options.branches == 1 else [f"future {index + 1}" for index in range(len(futures))]
-    views = {label: sheets.views_of_frames(frames, 0)
-             for label, frames in zip(labels[:MOST_COLUMNS], futures[:MOST_COLUMNS], strict=True)}
-    sequence = window.sequence
-    title = f"{config.model.variant} step {loaded.step}   {sequence.name} from frame {window.start}"
-    written = sheets.write_dream(
-        options.out or loaded.folder / "dreams", sheets.views_of_batch(batch, 0), views, np.asarray(batch.action[0]),
-        sheets.Scene.of(config), context=config.data.context, title=title, beside=moved_views(batch, config),
-        name=f"{sequence.split}_{sequence.name.rpartition('/')[2]}_{window.start:04d}")
+    views = {label: sheets.views_of_frames(frames, 0) for label, frames in zip(labels, futures, strict=True)}
+    written = draw(options, config, batch, views, window, loaded.folder, f"{config.model.variant} step {loaded.step}")
     for path in written:
         show.line(f"wrote {path}")
+    return written
+
+
+def draw(options: Options, config: config_lib.Config, batch: types.Batch, views: Mapping[str, Sequence[sheets.View]],
+         window: windows.Window, folder: pathlib.Path, model_name: str) -> list[pathlib.Path]:
+    """Everything that shows the first window of a batch and its futures; returns the files written."""
+    truth, actions = sheets.views_of_batch(batch, 0), np.asarray(batch.action[0])
+    scene, context, beside = sheets.Scene.of(config), config.data.context, moved_views(batch, config)
+    sequence, out = window.sequence, options.out or folder / "dreams"
+    name = f"{sequence.split}_{sequence.name.rpartition('/')[2]}_{window.start:04d}"
+    title = f"{model_name}   {sequence.name} from frame {window.start}"
+    few = {label: views[label] for label in list(views)[:MOST_COLUMNS]}
+    written = sheets.write_dream(out, truth, few, actions, scene, context=context, title=title, beside=beside,
+                                 name=name, most_moments=options.moments)
+    written.append(page.write_page(out / f"{name}.html", truth, views, actions, scene, context=context, title=title,
+                                   beside=beside))
+    if options.rerun:
+        log = rerun_log.RerunLog(options.rerun)
+        log.window(batch, {"truth": truth, **views, **beside}, scene, context=context,
+                   poses=warp.path(batch, context, config))
+        written.append(log.close())
     return written
 
 

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import pathlib
 import sys
+from collections.abc import Mapping
 from typing import Annotated, Any
 
 import tyro
@@ -18,9 +20,10 @@ with late.imports():
     from muvo_jax import evaluation_report
     from muvo_jax.agents import forecasts
     from muvo_jax.data import fitting, pipeline
-    from muvo_jax.metrics import protocol
+    from muvo_jax.metrics import baselines, protocol, warp
     from muvo_jax.model import world_model
     from muvo_jax.training import checkpoint_meta, screen, validation
+    from muvo_jax.viz import rerun_log, sheets
 
 
 TRAINING_WINDOWS = 8  # of the split "train", where it is not asked for by name
@@ -57,6 +60,8 @@ class Options:
     """Draw the latents instead of taking their means."""
     uncertainty: int = 0
     """Also sample so many futures of each window, and measure how far they can be trusted (RUN/uncertainty.png)."""
+    rerun: Annotated[pathlib.Path | None, command_line.shown("FILE.rrd", "none")] = None
+    """Also log the first window of each split, with all baselines, for the Rerun viewer (extra [viz])."""
 
 
 EXAMPLES = """
@@ -75,6 +80,7 @@ def evaluate(options: Options, show: screen.Screen) -> dict[str, Any]:
               "chamfer_points": "evaluation.chamfer_points", "sampled": "evaluation.sampled"}
     if options.uncertainty < 0 or options.uncertainty == 1:
         raise ValueError(f"--uncertainty is {options.uncertainty}; expected two futures or more, or 0 for none.")
+    log = rerun_log.RerunLog(options.rerun) if options.rerun else None
     chosen = command_line.chosen_settings(options, fields)
     config = config_lib.override_all(loaded.config, chosen)
     recording = command_line.open_data(config, show)
@@ -93,7 +99,8 @@ def evaluate(options: Options, show: screen.Screen) -> dict[str, Any]:
         if split == "train" and not options.splits:  # what was learned by heart needs no close look
             count = min(count or TRAINING_WINDOWS, TRAINING_WINDOWS)
         scores = protocol.evaluate(world_model.WorldModel(config.model), loaded.variables,
-                                   validation.windows(frames, split, count), config, mean)
+                                   validation.windows(frames, split, count), config, mean,
+                                   look=log and functools.partial(log_windows, log, config, split))
         if options.uncertainty:
             scores["uncertainty"] = forecasts.measure(
                 world_model.WorldModel(config.model), loaded.variables, jax.random.key(config.evaluation.seed),
@@ -109,9 +116,24 @@ def evaluate(options: Options, show: screen.Screen) -> dict[str, Any]:
     written = evaluation_report.write_report(loaded.folder, report, suffix)
     if options.uncertainty:
         written += (evaluation_report.draw_uncertainty(loaded.folder / f"uncertainty{suffix}.png", report),)
+    written += (log.close(),) if log else ()
     for path in written:
         show.line(f"wrote {path}")
     return report
+
+
+def log_windows(log: rerun_log.RerunLog, config: config_lib.Config, split: str, item: protocol.Windows,
+                guesses: Mapping[str, Mapping[str, baselines.Frames]]) -> None:
+    """Logs the first of these windows and what every source makes of it (protocol.Look); where a baseline says nothing
+    of observed frames, these stand as they were recorded."""
+    truth, context = sheets.views_of_batch(item.batch, 0), config.data.context
+    sources = {"truth": truth}
+    for source, ahead in guesses["imagined"].items():
+        seen = guesses["observed"].get(source)
+        before = truth[:context] if seen is None else sheets.views_of_frames(seen, 0)
+        sources[evaluation_report.SOURCES[source]] = before + sheets.views_of_frames(ahead, 0)
+    log.window(item.batch, sources, sheets.Scene.of(config), context=context,
+               poses=warp.path(item.batch, context, config), name=split)
 
 
 def fit(config: config_lib.Config, recording, chosen: tuple[str, ...]) -> config_lib.Config:

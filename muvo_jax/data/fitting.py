@@ -15,7 +15,7 @@ SHORT_RECORDING_FRAMES = 100
 _SHORT = {"stride": 1, "context": 4, "horizon": 4, "frames": 8}
 _SIDE_MULTIPLE = 32
 # What a trained network was built with: give it to `adapt` to keep, beside what the user chose.
-OF_TRAINED = ("model.range_view.rows",)
+OF_TRAINED = ("model.range_view.rows", "model.range_view.columns")
 
 
 class Adapted(NamedTuple):

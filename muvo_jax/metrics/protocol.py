@@ -8,7 +8,7 @@ left out; what is undefined as a whole is NaN, never 0. BatchNorm runs on its ru
 from __future__ import annotations
 
 import functools
-from collections.abc import Collection, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from typing import Any, NamedTuple
 
 import jax
@@ -41,6 +41,9 @@ class Windows(NamedTuple):
     batch: types.Batch
     drives: tuple[str, ...]
     other_action: types.ArrayLike | None = None
+
+
+Look = Callable[[Windows, Mapping[str, Mapping[str, baselines.Frames]]], None]
 
 
 def identity(config: config_lib.Config) -> str:
@@ -103,7 +106,7 @@ def finish(predictions: types.Predictions, model: config_lib.ModelConfig) -> dic
 
 def evaluate(model: world_model.WorldModel | None, variables: types.Variables | None, windows: Iterable[Windows],
              config: config_lib.Config, training_mean: baselines.Frames | None = None, *,
-             sources: Collection[str] = SOURCES) -> dict[str, Any]:
+             sources: Collection[str] = SOURCES, look: Look | None = None) -> dict[str, Any]:
     """Scores a model and the baselines on the windows of one split.
 
     Args:
@@ -112,13 +115,14 @@ def evaluate(model: world_model.WorldModel | None, variables: types.Variables | 
       config: of the run; `data` and `evaluation` say how.
       training_mean: from baselines.TrainingMean.prediction, or None to leave that baseline out.
       sources: which of SOURCES to judge.
+      look: called once with the first windows and what all sources make of them, {phase: {source: frames}}.
 
     Returns:
       JSON-ready {"protocol", "windows", "drives", "observed": {source: scores}, "imagined": {source: scores},
       "action_shuffle": {head: ratio} (answers.py), "copy_last_unknown_voxels", "movers"}; baselines that repeat or move
       the last observed frame have imagined steps only. "movers" says what their scores look at, None for nothing.
     """
-    judge = _Judge(config, training_mean, sources)
+    judge = _Judge(config, training_mean, sources, look)
     key = jax.random.key(config.evaluation.seed)
     data, sampled = config.data, config.evaluation.sampled
     dispatched = ((index, item, _predict(model, variables, jax.random.fold_in(key, index), item.batch,
@@ -132,8 +136,9 @@ def evaluate(model: world_model.WorldModel | None, variables: types.Variables | 
 class _Judge:
     """Tallies of all sources over one split."""
 
-    def __init__(self, config: config_lib.Config, training_mean: baselines.Frames | None, sources: Collection[str]):
-        self._config, self._mean, self._sources = config, training_mean, sources
+    def __init__(self, config: config_lib.Config, training_mean: baselines.Frames | None, sources: Collection[str],
+                 look: Look | None):
+        self._config, self._mean, self._sources, self._look = config, training_mean, sources, look
         self._tallies: dict[str, dict[str, tally.Tally]] = {phase: {} for phase in PHASES}
         self._answers = answers.Answers(config)
         self._windows = self._unknown = 0
@@ -155,6 +160,8 @@ class _Judge:
             if other:
                 self._answers.add(guesses["imagined"]["model"], other, truth.time_slice(*steps["imagined"]),
                                   item.drives)
+        if self._look is not None and index == 0:
+            self._look(item, guesses)
         for phase, (start, stop) in steps.items():
             part = truth.time_slice(start, stop)
             movers = self._movers_of(part, moved.get("warp_last", {}) if phase == "imagined" else {})

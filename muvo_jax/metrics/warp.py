@@ -10,6 +10,7 @@ import functools
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from muvo_jax import config as config_lib
 from muvo_jax import types
@@ -57,9 +58,18 @@ def warp(batch: types.Batch, context: int, horizon: int, config: config_lib.Conf
                                 config.data.stride))
 
 
+def path(batch: types.Batch, context: int, config: config_lib.Config) -> np.ndarray | None:
+    """Where `warp` takes the car of the first window to be: float32 [T, 3], forward and left (m) and turn to the
+    left (rad) in the frame of the first observation; None where the motion is unknown."""
+    source = motion_source(batch, config)
+    if source is None:
+        return None
+    return np.asarray(_poses(batch[:1], context, source, config.contract, config.data.stride)[0])
+
+
 @functools.partial(jax.jit, static_argnums=range(1, 9))
 def _warp(batch, context, horizon, source, fused, geometry, grid, contract, stride):
-    poses = _recorded_poses(batch) if source == "recorded" else _driven_poses(batch, context, contract, stride)
+    poses = _poses(batch, context, source, contract, stride)
     count = batch.batch_size
     merge = lambda leaf: leaf.reshape(-1, *leaf.shape[2:])
     repeat = lambda leaf: jnp.repeat(leaf, horizon, axis=0)
@@ -93,6 +103,11 @@ def _warp(batch, context, horizon, source, fused, geometry, grid, contract, stri
 def _evidence(occupancy: jax.Array, unknown: float) -> jax.Array:
     return jnp.where(occupancy == types.OCCUPANCY_UNKNOWN, unknown,
                      2.0 * (occupancy == types.OCCUPANCY_OCCUPIED) - 1.0).astype(jnp.float32)
+
+
+def _poses(batch: types.Batch, context: int, source: str, contract: config_lib.ActionContract,
+           stride: int) -> jax.Array:
+    return _recorded_poses(batch) if source == "recorded" else _driven_poses(batch, context, contract, stride)
 
 
 def _driven_poses(batch: types.Batch, context: int, contract: config_lib.ActionContract, stride: int) -> jax.Array:

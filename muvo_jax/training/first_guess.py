@@ -32,11 +32,16 @@ def constants(mean: baselines.TrainingMean, config: config_lib.ModelConfig) -> d
 def fill(state: state_lib.TrainState, mean: baselines.TrainingMean, config: config_lib.ModelConfig,
          plan: parallel_lib.Plan) -> state_lib.TrainState:
     """`state` with the constants of `mean`, placed as `plan` says."""
-    batch_stats = {**state.batch_stats}
-    if not isinstance(config.first_guess, config_lib.ZeroGuess):
-        batch_stats |= constants(mean, config)
+    found = measured(mean, config)
+    batch_stats = {**state.batch_stats, **{name: {**state.batch_stats.get(name, {}), **values}
+                                           for name, values in found.items()}}
+    return parallel_lib.place_state(plan, dataclasses.replace(state, batch_stats=batch_stats))
+
+
+def measured(mean: baselines.TrainingMean, config: config_lib.ModelConfig) -> dict[str, dict[str, np.ndarray]]:
+    """All that a model's `batch_stats` hold of its training frames: `constants`, and how large actions usually are."""
+    found = {} if isinstance(config.first_guess, config_lib.ZeroGuess) else constants(mean, config)
     if config.action_path == "recurrence" and mean.action is not None:
         spread = np.sqrt(mean.action / mean.frames)
-        batch_stats["transition"] = {**batch_stats.get("transition", {}),
-                                     "action_spread": np.maximum(spread, _LEAST_SPREAD).astype(np.float32)}
-    return parallel_lib.place_state(plan, dataclasses.replace(state, batch_stats=batch_stats))
+        found["transition"] = {"action_spread": np.maximum(spread, _LEAST_SPREAD).astype(np.float32)}
+    return found

@@ -6,19 +6,17 @@ import pathlib
 from collections.abc import Callable
 from typing import Any
 
-import jax
-
 from muvo_jax import config as config_lib
 from muvo_jax import types
 from muvo_jax.data import pipeline
 from muvo_jax.training import (
     checkpoint,
-    checkpoint_meta,
     first_guess,
     integrity,
     preparation,
     run_folder,
     screen,
+    transfer,
     validation,
 )
 from muvo_jax.training import state as state_lib
@@ -35,7 +33,7 @@ def first(init: pathlib.Path | None, pretrained: Pretrained | None, show: screen
       ValueError: where its weights, or those of `pretrained`, belong to another network.
     """
     if init:
-        return _from_run(init, show, config, ready)
+        return _from_run(init, show, config, ready, frames)
     state = ready.state
     if pretrained is not None:
         variables, notes = pretrained(state.variables, config.model)
@@ -78,15 +76,17 @@ def resume(keeper: checkpoint.Checkpoints, show: screen.Screen, config: config_l
     return restored.state, restored.step, restored.data_state
 
 
-def _from_run(run: pathlib.Path, show: screen.Screen, config: config_lib.Config,
-              ready: preparation.Prepared) -> state_lib.TrainState:
+def _from_run(run: pathlib.Path, show: screen.Screen, config: config_lib.Config, ready: preparation.Prepared,
+              frames: pipeline.Frames) -> state_lib.TrainState:
     """A state at step 0 with the weights of another run."""
     loaded = checkpoint.load_run(run)
     for text in loaded.warnings:
         show.warn(text)
-    shapes = lambda tree: jax.tree.map(lambda leaf: leaf.shape, tree)
-    numerics = (config.model.numerics, loaded.config.model.numerics)
-    if numerics[0] != numerics[1] or shapes(dict(loaded.variables)) != shapes(ready.state.variables):
-        checkpoint_meta.check_architecture(config, loaded.config, str(run))
-    show.field("weights", f"of step {loaded.step} of {run}")
-    return ready.with_variables(loaded.variables, config)
+    variables, taken = loaded.variables, ""
+    wanted = ready.state.variables
+    if (config.model.numerics != loaded.config.model.numerics
+            or transfer.shapes(loaded.variables) != transfer.shapes(wanted)):
+        variables = transfer.to_recording(loaded, config, wanted, frames)
+        taken = ", as far as this recording has its inputs; average frames are this recording's"
+    show.field("weights", f"of step {loaded.step} of {run}{taken}")
+    return ready.with_variables(variables, config)

@@ -93,6 +93,16 @@ def windows_of_run(run: run_lib.Run | str | os.PathLike, split: str | None = Non
     return entry.batch
 
 
+def sample_scores(run: run_lib.Run, count: int) -> dict[str, float]:
+    """What a run scores on a few windows of the first split held out, {metric: its mean over imagined steps}: what a
+    model that ships says of itself in its card, so that anybody can recompute it in a minute."""
+    recording = recordings.open_configured(run.config, split=recordings.HELD_OUT)
+    config = fitting.adapt(run.config, recording, keep=fitting.OF_TRAINED).config
+    found = protocol.evaluate(run.model, run.variables, windows(pipeline.Frames(recording, config), recordings.HELD_OUT,
+                                                                count), config, sources=("model",))
+    return {name: score["mean"] for name, score in found["imagined"]["model"].items() if head_lib.metrics()[name].label}
+
+
 def training_mean(frames: pipeline.Frames, most_frames: int = TRAINING_MEAN_FRAMES) -> tuple[baselines.Frames, int]:
     """The mean training frame over at most `most_frames` evenly spread frames, and how many went in."""
     mean = training_sums(frames, most_frames)

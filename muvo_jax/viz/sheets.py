@@ -80,6 +80,12 @@ def views_of_frames(frames: Mapping[str, np.ndarray], sample: int | tuple[int, .
     return [{name: value[frame] for name, value in chosen.items()} for frame in range(count)]
 
 
+def pictures(view: View, views: Sequence[str] = VIEWS) -> list[tuple[str, head_lib.Picture]]:
+    """(head, picture) of these views that a moment has, in the order of heads."""
+    return [(name, picture) for name, frames in head_lib.shown(tuple(view)).items() for picture in frames.pictures
+            if picture.view in views]
+
+
 def dream_frame(columns: Sequence[tuple[str, View]], scene: Scene, *, badge: str, caption: str,
                 action: np.ndarray) -> np.ndarray:
     """One animation frame: a column for the truth, first, and one for each prediction, the applied action below."""
@@ -128,7 +134,7 @@ def space_sheet(moments: Sequence[Moment], scene: Scene, *, title: str) -> np.nd
 
 def legend(view: View, scene: Scene, columns: int, *, views: Sequence[str] = VIEWS) -> np.ndarray:
     """Colour bars with units for what pictures of these views show, wrapped to the width of the page."""
-    asked = {entry for _, picture in _pictures(view, views) for entry in picture.legend}
+    asked = {entry for _, picture in pictures(view, views) for entry in picture.legend}
     low_m, high_m = panels.height_span(scene.grid)
     bar = lambda colours, low, high, name: canvas.colour_bar(colours, low, high, name, 120)
     known = {"range": [bar(canvas.RANGE_COLOURS, "0 m", f"{scene.far_m:.0f} m", "range (square root)"),
@@ -183,16 +189,10 @@ def write_dream(folder: str | os.PathLike, truth: Sequence[View], predictions: M
     return written
 
 
-def _pictures(view: View, views: Sequence[str]) -> list[tuple[str, head_lib.Picture]]:
-    """(head, picture) of these views that a moment has, in the order of heads."""
-    return [(name, picture) for name, frames in head_lib.shown(tuple(view)).items() for picture in frames.pictures
-            if picture.view in views]
-
-
 def _side_by_side(moment: Moment, scene: Scene, views: Sequence[str], columns_px: int) -> dict[str, list[np.ndarray]]:
     """Name of each picture of the truth -> those of truth and dreams, blank where a dream does not say it."""
     groups: dict[str, list[np.ndarray]] = {}
-    for name, picture in _pictures(moment.truth, views):
+    for name, picture in pictures(moment.truth, views):
         groups[picture.name] = [_drawn(name, picture, view, moment.truth, scene, columns_px)
                                 for view in (moment.truth, *moment.dreams.values())]
     return groups
@@ -226,7 +226,7 @@ def _row_name(what: str, who: str, rows: int) -> np.ndarray:
 def _view_column(view: View, truth: View, scene: Scene) -> np.ndarray:
     """All of one moment, WIDE_PX wide: as the sensors see it, from above two side by side, then ahead."""
     draw = lambda kind, columns_px: [_drawn(name, picture, view, truth, scene, columns_px) for name, picture in
-                                     _pictures(truth, (kind,))]
+                                     pictures(truth, (kind,))]
     above = draw("above", SQUARE_PX)
     pairs = [canvas.stack(above[start:start + 2], axis=1, gap=WIDE_PX - 2 * SQUARE_PX)
              for start in range(0, len(above), 2)]

@@ -59,6 +59,8 @@ def test_range_views_have_no_rows_that_no_beam_fills(kitti_recording, rows, fitt
     assert fitting.adapt(config, other).config == config
     for keep in ({"model.range_view.rows"}, fitting.OF_TRAINED):
         assert fitting.adapt(presets.get("town"), other, keep=keep).config.model.range_view.rows == 64
+    trained = fitting.adapt(presets.get("town"), other, keep=fitting.OF_TRAINED).config.model.range_view
+    assert trained.columns == presets.get("town").model.range_view.columns
 
 
 def test_a_short_recording_gets_short_windows(kitti_recording):

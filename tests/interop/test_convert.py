@@ -149,7 +149,7 @@ def test_a_converted_run_is_judged_dreams_and_trains_on(tmp_path, monkeypatch):
                                screen.Screen())
     assert "val_rl" in json.dumps(judged) and (tmp_path / "run" / "evaluation.json").exists()
     drawn = dream.dream(dream.Options(tmp_path / "run", context=2, horizon=2), screen.Screen())
-    assert {path.suffix for path in drawn} == {".gif", ".png"} and all(path.stat().st_size for path in drawn)
+    assert {path.suffix for path in drawn} == {".gif", ".png", ".html"} and all(path.stat().st_size for path in drawn)
     train.train(train.Options(preset="tiny", init=tmp_path / "run", name="more", runs_dir=tmp_path, steps=1, batch=1,
                               evaluate=False), screen.Screen())
     assert checkpoint.load_run(tmp_path / "more").config.model == checkpoint.load_run(tmp_path / "run").config.model

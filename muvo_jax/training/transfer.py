@@ -1,0 +1,58 @@
+"""A trained model for another recording: one that lacks an input of the old one, and has another average frame."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import jax
+import numpy as np
+
+from muvo_jax import config as config_lib
+from muvo_jax import run as run_lib
+from muvo_jax import types
+from muvo_jax.data import pipeline
+from muvo_jax.training import checkpoint_meta, first_guess, validation
+
+
+def to_recording(loaded: run_lib.Run, config: config_lib.Config, wanted: types.Variables,
+                 frames: pipeline.Frames) -> types.Variables:
+    """The variables of a run for a network that lacks route, navigation or speed among its inputs.
+
+    What the old network knows of these is left out; the average frame and the spread of actions are measured on the
+    training frames, as a fresh model's are. Everything else stays.
+
+    Args:
+      loaded: what is taken over.
+      config: of the new run, fitted to the recording.
+      wanted: the new network's variables, or their shapes.
+      frames: of the recording.
+
+    Raises:
+      ValueError: naming both networks where they differ in anything else.
+    """
+    params = {name: value for name, value in loaded.variables["params"].items() if name in wanted["params"]}
+    ours, theirs = _token_kinds(config.model), _token_kinds(loaded.config.model)
+    if isinstance(config.model.latent, config_lib.TokenLatent) and set(ours) < set(theirs):
+        rows = np.array([theirs.index(kind) for kind in ours])
+        params["fusion"] = {**params["fusion"], "type_embedding": params["fusion"]["type_embedding"][rows]}
+    if config.model.numerics != loaded.config.model.numerics or shapes(params) != shapes(wanted["params"]):
+        checkpoint_meta.check_architecture(config, loaded.config, str(loaded.folder))
+    measured = first_guess.measured(validation.training_sums(frames), config.model)
+    stats = {name: {**loaded.variables["batch_stats"].get(name, {}), **measured.get(name, {})}
+             for name in wanted["batch_stats"]}
+    return {"params": params, "batch_stats": stats}
+
+
+def shapes(tree: Mapping[str, Any]) -> Any:
+    """The shape of every leaf."""
+    return jax.tree.map(lambda leaf: tuple(leaf.shape), dict(tree))
+
+
+def _token_kinds(model: config_lib.ModelConfig) -> tuple[str, ...]:
+    """What each row of the fusion's type embedding stands for, in its order (world_model, fusion)."""
+    names = [name for name in ("camera", "lidar") if getattr(model, name) is not None]
+    names += ["route"] if model.route else []
+    names += ["command", "next_command", "target"] if model.navigation else []
+    return tuple(names + (["speed"] if model.speed else []))
+

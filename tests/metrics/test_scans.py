@@ -1,4 +1,4 @@
-"""Forecasts along the rays of recorded scans: worked arithmetic, the box, rays without a predicted return."""
+"""Forecasts along the rays of recorded scans: worked arithmetic, the box, rays where nothing is predicted."""
 
 import numpy as np
 import pytest
@@ -47,10 +47,18 @@ def test_points_outside_the_box_count_for_no_distance_and_rays_end_where_they_le
     assert np.isnan(found["near_m2"]) and found["l1_m"] == found["absrel_percent"] == 0.0
 
 
-def test_a_ray_without_a_predicted_return_ends_at_the_box():
+def view_of(range_m):
+    """A range view that shows one range everywhere."""
+    return np.full((GEOMETRY.rows, GEOMETRY.columns, 4), range_m, np.float32)
+
+
+def test_a_ray_without_a_predicted_return_asks_the_nearest_one_and_ends_at_the_box():
     scan = np.array([[6.0, 0.0, 2.0]], np.float32)  # straight ahead, 5 m from the lidar; the box ends at 20 m
-    hole = np.full((GEOMETRY.rows, GEOMETRY.columns, 4), -1.0, np.float32)
-    found = scores(hole, scan)
+    assert all(np.isnan(value) for value in scores(view_of(-1.0), scan).values())  # there is none
+    view = view_of(-1.0)
+    view[:, 0], view[:, 150] = 9.0, 8.0  # behind the lidar, and to its right, which is nearer
+    assert scores(view, scan) == pytest.approx({"near_m2": 9.0, "l1_m": 3.0, "absrel_percent": 60.0}, rel=1e-5)
+    found = scores(view_of(50.0), scan)
     assert np.isnan(found["near_m2"])
     assert (found["l1_m"], found["absrel_percent"]) == pytest.approx((15.0, 300.0), rel=1e-3)
 
@@ -58,7 +66,7 @@ def test_a_ray_without_a_predicted_return_ends_at_the_box():
 def test_the_box_stays_where_the_last_observed_lidar_stood():
     """The car drives 15 m ahead and turns to the left by a right angle: ahead of it the box now ends after 19 m, to its
     right after 6."""
-    view = np.full((GEOMETRY.rows, GEOMETRY.columns, 4), -1.0, np.float32)
+    view = view_of(50.0)
     motion = np.array([[[15.0, 0.0, np.pi / 2, 0.0]]])
     # The lidar, 1 m ahead of the ego's origin, stands at (14, 1) of the old lidar's frame.
     ahead, right = (np.array([point], np.float32) for point in ([4.0, 0.0, 2.0], [1.0, -3.0, 2.0]))

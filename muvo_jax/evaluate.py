@@ -19,8 +19,8 @@ with late.imports():
     from muvo_jax import config as config_lib
     from muvo_jax import evaluation_report
     from muvo_jax.agents import forecasts
-    from muvo_jax.data import fitting, pipeline
-    from muvo_jax.metrics import baselines, protocol, warp
+    from muvo_jax.data import fitting, pipeline, schema, windows
+    from muvo_jax.metrics import baselines, cards, protocol, warp
     from muvo_jax.model import world_model
     from muvo_jax.training import checkpoint_meta, screen, validation
     from muvo_jax.viz import rerun_log, sheets
@@ -34,8 +34,8 @@ class Options:
     """Judges a run on every split: frames that it observed and frames that it imagined, beside baselines that learned
     nothing, and whether what it imagines answers to the actions.
 
-    Prints tables and writes RUN/evaluation.json and RUN/report.md (with the name of the recording where it is another
-    one than the run's).
+    Prints tables and writes RUN/evaluation.json and RUN/report.md (with the name of the card that was asked for, and
+    of the recording where it is another one than the run's). Every table says which protocol card it follows.
     """
 
     run: Annotated[pathlib.Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
@@ -44,6 +44,8 @@ class Options:
     """latest, best (skill of imagined frames, docs/design.md) or a step."""
     splits: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME ...", help_behavior_hint="(default: all)")] = ()
     """Which ones to judge; not named, "train" is judged by a few windows."""
+    card: Annotated[str, command_line.shown("NAME", "the run's own settings")] = ""
+    """Judge by this protocol card: one of muvo_jax/cards (town, authors, kitti-4docc-1s), or a path to one's own."""
     data: Annotated[str | None, command_line.shown("PATH", "the run's")] = None
     """Another recording than the one that the run was trained on."""
     context: Annotated[int | None, command_line.shown("N", "the run's")] = None
@@ -68,12 +70,14 @@ EXAMPLES = """
 python -m muvo_jax.evaluate runs/town-tr
 python -m muvo_jax.evaluate runs/town-tr --splits val_ds --windows=0  (all windows)
 python -m muvo_jax.evaluate runs/town-tr --splits val_rl --windows=16 --uncertainty=8
+python -m muvo_jax.evaluate runs/town-tr --card=authors
 python -m muvo_jax.evaluate runs/town-tr --context=8 --horizon=10 --checkpoint=best
 """
 
 
 def evaluate(options: Options, show: screen.Screen) -> dict[str, Any]:
     """Does what the command line asks for; returns what evaluation.json holds."""
+    card = cards.load(options.card) if options.card else None
     loaded = command_line.load_run(options.run, options.checkpoint, show)
     fields = {"data": "data.path", "context": "data.context", "horizon": "data.horizon",
               "windows": "evaluation.windows", "batch": "evaluation.batch",
@@ -83,15 +87,19 @@ def evaluate(options: Options, show: screen.Screen) -> dict[str, Any]:
     log = rerun_log.RerunLog(options.rerun) if options.rerun else None
     chosen = command_line.chosen_settings(options, fields)
     config = config_lib.override_all(loaded.config, chosen)
+    config = card.applied(config, chosen) if card else config
     recording = command_line.open_data(config, show)
-    config = fit(config, recording, tuple(chosen))
+    splits = options.splits or _splits(card, recording)
+    config = fit(config, recording, (*chosen, *(card.settings if card else ())), splits)
+    if card and (problem := card.foreign(config, recording.description.kind)):
+        raise ValueError(problem)
     frames = pipeline.Frames(recording, config)
-    splits = options.splits or tuple(sorted(recording.description.splits, key=lambda split: split == "train"))
     mean, mean_frames = validation.training_mean(frames) if "train" in recording.description.splits else ({}, 0)
     report: dict[str, Any] = {
         "run": str(loaded.folder), "variant": config.model.variant, "step": loaded.step,
         "parameters": sum(leaf.size for leaf in jax.tree.leaves(loaded.variables["params"])),
         "data": {"name": recording.description.name, "path": config.data.path}, "protocol": protocol.identity(config),
+        "card": {"name": card.name, "about": card.about, "notes": card.notes} if card else None,
         "training_mean_frames": mean_frames, "packages": checkpoint_meta.package_versions(), "splits": {}}
     for split in splits:
         show.line(f"evaluating {split} ...", style="dim")
@@ -101,6 +109,7 @@ def evaluate(options: Options, show: screen.Screen) -> dict[str, Any]:
         scores = protocol.evaluate(world_model.WorldModel(config.model), loaded.variables,
                                    validation.windows(frames, split, count), config, mean,
                                    look=log and functools.partial(log_windows, log, config, split))
+        scores = _named(scores, card, frames, split, count)
         if options.uncertainty:
             scores["uncertainty"] = forecasts.measure(
                 world_model.WorldModel(config.model), loaded.variables, jax.random.key(config.evaluation.seed),
@@ -109,10 +118,11 @@ def evaluate(options: Options, show: screen.Screen) -> dict[str, Any]:
             for line in evaluation_report.uncertainty_table(scores["uncertainty"]):
                 show.line(line)
         report["splits"][split] = scores
-        for phase in protocol.PHASES:
+        for phase in evaluation_report.judged_phases(scores):
             show.console.print(evaluation_report.screen_table(split, phase, scores))
         show.line(evaluation_report.answers_line(scores["action_shuffle"]))
-    suffix = f"-{recording.description.name}" if options.data else ""
+    suffix = f"-{pathlib.Path(card.name).stem}" if card else ""
+    suffix += f"-{recording.description.name}" if options.data else ""
     written = evaluation_report.write_report(loaded.folder, report, suffix)
     if options.uncertainty:
         written += (evaluation_report.draw_uncertainty(loaded.folder / f"uncertainty{suffix}.png", report),)
@@ -136,13 +146,43 @@ def log_windows(log: rerun_log.RerunLog, config: config_lib.Config, split: str, 
                poses=warp.path(item.batch, context, config), name=split)
 
 
-def fit(config: config_lib.Config, recording, chosen: tuple[str, ...]) -> config_lib.Config:
-    """The config fitted to a recording, whose sensors must be those that the model was trained with.
+def _splits(card: cards.Card | None, recording: schema.Recording) -> tuple[str, ...]:
+    """Those that are judged where none is named.
+
+    Raises:
+      ValueError: where the recording lacks one of the card's.
+    """
+    held = recording.description.splits
+    if card is None:
+        return tuple(sorted(held, key=lambda split: split == "train"))
+    if lacking := ", ".join(split for split in card.splits if split not in held):
+        raise ValueError(f"card {card.name} judges {', '.join(card.splits)}, but recording "
+                         f"{recording.description.name!r} has no {lacking}; it has {', '.join(held)}. Name one "
+                         f"of these with --splits: its numbers are then said to be of other samples.")
+    return card.splits or tuple(split for split in held if split != "train")
+
+
+def _named(scores: dict[str, Any], card: cards.Card | None, frames: pipeline.Frames, split: str,
+           count: int) -> dict[str, Any]:
+    """The scores of a split with the name of their card and the list of samples that they come from."""
+    chosen = pipeline.evaluation_windows(frames, split, windows=count)
+    samples = cards.Samples(len(chosen), windows.fingerprint(chosen))
+    if card is None:
+        name = cards.label(frames.config, frames.recording.description.kind, split, samples)
+    else:
+        name, scores = card.label(split, samples), cards.defined(card, scores)
+    return {"card": name, "samples": dataclasses.asdict(samples), **scores}
+
+
+def fit(config: config_lib.Config, recording: schema.Recording, chosen: tuple[str, ...],
+        splits: tuple[str, ...] | None = None) -> config_lib.Config:
+    """The config fitted to a recording, whose sensors must be those that the model was trained with; windows need to
+    fit into these splits alone (None: all).
 
     Raises:
       ValueError: naming both where the recording asks for another network.
     """
-    fitted = fitting.adapt(config, recording, keep=(*chosen, *fitting.OF_TRAINED)).config
+    fitted = fitting.adapt(config, recording, keep=(*chosen, *fitting.OF_TRAINED), splits=splits).config
     where = f"recording {recording.description.name!r} asks for another model than this run, which"
     checkpoint_meta.check_architecture(fitted, config, where)
     return fitted

@@ -14,7 +14,7 @@ import rich.table
 from muvo_jax import head as head_lib
 from muvo_jax.agents import forecasts
 from muvo_jax.data import words
-from muvo_jax.metrics import occupancy, protocol
+from muvo_jax.metrics import cards, occupancy, protocol
 
 SOURCES = {"model": "model", "copy_last": "copy-last", "warp_last": "warp-last", "warp_fused": "warp-fused",
            "training_mean": "training mean"}
@@ -27,7 +27,8 @@ def screen_table(split: str, phase: str, scores: Mapping[str, Any]) -> rich.tabl
     """
     phase_scores, imagined = scores[phase], phase == "imagined"
     last_step = f" (step {len(next(iter(phase_scores['model'].values()))['per_step'])})" if imagined else ""
-    table = rich.table.Table(title=f"{split}: {phase} frames{last_step}, {counts_text(scores)}", title_justify="left")
+    table = rich.table.Table(title=f"{split}: {phase} frames{last_step}, {counts_text(scores)}; {card_text(scores)}",
+                             title_justify="left")
     table.add_column("metric")
     for source in phase_scores:
         table.add_column(SOURCES[source], justify="right")
@@ -47,6 +48,11 @@ def screen_table(split: str, phase: str, scores: Mapping[str, Any]) -> rich.tabl
     return table
 
 
+def judged_phases(scores: Mapping[str, Any]) -> tuple[str, ...]:
+    """The phases of a split in which anything is scored: a card may define no score of observed frames."""
+    return tuple(phase for phase in protocol.PHASES if scores[phase].get("model"))
+
+
 def _labelled(scores: Mapping[str, Any]) -> list[tuple[str, head_lib.Metric]]:
     """The metrics among these scores that people read, in the order of the report."""
     return [(name, metric) for name, metric in head_lib.metrics().items() if metric.label and name in scores]
@@ -59,6 +65,12 @@ def _title(metric: head_lib.Metric) -> str:
 def counts_text(scores: Mapping[str, Any]) -> str:
     """Such as "16 windows of 4 drives"."""
     return f"{words.counted(scores['windows'], 'window')} of {words.counted(scores['drives'], 'drive')}"
+
+
+def card_text(scores: Mapping[str, Any]) -> str:
+    """Such as "card town"."""
+    name = scores.get("card", cards.NONE)
+    return name if name == cards.NONE else f"card {name}"
 
 
 def marked(values: Mapping[str, float], sources: Mapping[str, Any], decimals: int, higher: bool,
@@ -121,9 +133,14 @@ def markdown(report: Mapping[str, Any]) -> str:
              f"{report['training_mean_frames']} frames. Bold is best. Chamfer and PSNR are means over frames; voxel "
              f"scores and movers' PSNR come from sums over the whole split. In brackets 95 % intervals by bootstrap "
              f"over drives. Above the road: {occupancy.ABOVE_ROAD_M:g} m and more over the ground under the ego.", ""]
+    if report["card"]:
+        lines += [f"Card {report['card']['name']}: {report['card']['about']}", "",
+                  *(f"* {note}" for note in report["card"]["notes"]), ""]
     for split, scores in report["splits"].items():
-        lines += [f"## {split} ({counts_text(scores)})", ""]
-        for phase in protocol.PHASES:
+        samples = scores["samples"]
+        lines += [f"## {split} ({counts_text(scores)}; {card_text(scores)})", "",
+                  f"Samples {samples['fingerprint']}.", ""]
+        for phase in judged_phases(scores):
             lines += [f"### {phase} frames", "", *_average_table(scores[phase]), ""]
         lines += ["### imagined frames, step by step", "", *_step_table(scores["imagined"]), "",
                   "### answer to actions", "", *_answer_table(scores["action_shuffle"]), "",

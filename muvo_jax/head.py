@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 import importlib
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Protocol
 
 import jax.numpy as jnp
@@ -83,6 +83,7 @@ class Judged:
       seed: names these frames, for scores that draw a subset.
       threshold_m: a predicted return is a predicted range above this.
       movers: bool [B, T, X, Y, Z], the voxels that count as those of road users on the move; None where nobody knows.
+      scans: of each frame the recorded scan, float32 [P, 3], ego frame, m; None where no score asks for them.
     """
 
     frames: np.ndarray
@@ -91,6 +92,7 @@ class Judged:
     seed: tuple[int, ...] = ()
     threshold_m: float = 0.0
     movers: np.ndarray | None = None
+    scans: Sequence[Sequence[np.ndarray]] | None = None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -144,7 +146,7 @@ class Frames:
       field: of types.Batch, what was recorded.
       of: (predictions [..., *size, channels], config) -> frames as that field has them; runs under jit.
       sums: from judged frames to sums that add over windows: name -> {part: float64 [B, T]}.
-      metrics: name -> Metric.
+      metrics: name -> Metric; without its sums, which a setting may ask for, there is no score.
       error: (frames, truth, grid) -> the error of each frame, float64 [B, T], by which the answer to actions is
         measured (metrics/answers.py); None leaves the head out.
       error_name: what that error is of, for people.

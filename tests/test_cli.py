@@ -270,7 +270,10 @@ def test_report_marks_the_best_and_says_nan(tmp_path):
               "imagined": {"model": _scores(1.0), "copy_last": _scores(3.0), "training_mean": _scores(2.0)}}
     report = {"run": "runs/x", "variant": "RV-WOB-TR", "step": 3, "parameters": 1000, "data": {"name": "town"},
               "protocol": "p", "training_mean_frames": 9,
-              "splits": {"val_rl": {"windows": 2, "drives": 2, "copy_last_unknown_voxels": 5, "movers": None,
+              "card": {"name": "authors", "about": "As theirs.", "notes": ("It misleads.",)},
+              "splits": {"val_rl": {"card": "authors, other samples",
+                                    "samples": {"windows": 2, "fingerprint": "0123"},
+                                    "windows": 2, "drives": 2, "copy_last_unknown_voxels": 5, "movers": None,
                                     "action_shuffle": {"image": {"mean": 1.25, "interval": [float("nan")] * 2,
                                                                  "per_step": [1.0, 1.5]}}, **phases}}}
     evaluation_report.write_report(tmp_path, report)
@@ -284,7 +287,9 @@ def test_report_marks_the_best_and_says_nan(tmp_path):
     assert stored["splits"]["val_rl"]["imagined"]["model"]["chamfer_m"]["mean"] == "nan"
     assert stored["splits"]["val_rl"]["imagined"]["model"]["psnr_db"]["interval"] == [0.5, 2.0]
     table = evaluation_report.screen_table("val_rl", "imagined", report["splits"]["val_rl"])
-    assert table.row_count == 2
+    assert table.row_count == 2 and table.title.endswith("2 windows of 2 drives; card authors, other samples")
+    assert "(2 windows of 2 drives; card authors, other samples)" in page and "Samples 0123." in page
+    assert "Card authors: As theirs." in page and "* It misleads." in page
 
 
 def test_durations_read_well():
@@ -300,6 +305,13 @@ def test_the_whole_job_on_the_smallest_town(tmp_path):
     assert result.returncode == 0, result.stderr
     assert json.loads((run / "evaluation.json").read_text())["splits"].keys() == {"val_rl", "val_ds", "train"}
     assert list(run.glob("dreams/*.gif")) and list(run.glob("previews/*.png")) and (run / "curves.png").is_file()
+    judged = _command("muvo_jax.evaluate", str(run), "--card=authors", "--windows=1",
+                      XDG_CACHE_HOME=str(tmp_path / "cache"))
+    assert judged.returncode == 0, judged.stderr
+    theirs = json.loads((run / "evaluation-authors.json").read_text())["splits"]["val_rl"]
+    assert (theirs["card"], theirs["samples"]["windows"]) == ("authors", 1)
+    assert theirs["imagined"]["model"].keys() >= {"psnr_db", "chamfer_pixels_m", "iou_occ_all"}
+    assert "chamfer_m" not in theirs["imagined"]["model"]
     again = _command("muvo_jax.dream", str(run), "--branches=2", f"--out={tmp_path}/out",
                      XDG_CACHE_HOME=str(tmp_path / "cache"))
     assert again.returncode == 0, again.stderr

@@ -39,7 +39,9 @@ def main(run: str, name: str) -> None:
     scores = {split: {source: {name: pick(values[name]) for name in SCORES if name in values}
                       for source, values in entry["imagined"].items()}
               for split, entry in report["splits"].items() if split != "train"}
-    card = {"protocol": report["protocol"], "data": report["data"], "imagined": _rounded(scores)}
+    card = {"protocol": report["protocol"],
+            "card": {split: entry["card"] for split, entry in report["splits"].items() if split != "train"},
+            "data": report["data"], "imagined": _rounded(scores)}
     folder = builtin.seal(loaded, builtin.FOLDER / name, card)
     add_sample(name)
     size = sum(path.stat().st_size for path in pathlib.Path(folder).iterdir())

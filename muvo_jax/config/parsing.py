@@ -58,6 +58,10 @@ def _coerce(hint, value, path: str):
             return tuple(_coerce(kind, item, path) for kind, item in zip(inner, value, strict=True))
     if origin is types.UnionType and type(None) in arguments:
         return None if value is None else _coerce(arguments[0], value, path)
+    if origin is Mapping and isinstance(value, dict):
+        return {name: _coerce(arguments[1], item, f"{path}.{name}") for name, item in value.items()}
+    if hint is Any:
+        return value
     if hint is float and isinstance(value, int) and not isinstance(value, bool):
         return float(value)
     if isinstance(hint, type) and isinstance(value, hint) and (hint is bool or not isinstance(value, bool)):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import operator
 from typing import Annotated, Literal
 
 from muvo_jax.geometry import RouteMap
@@ -129,6 +130,12 @@ class EvaluationConfig:
       chamfer_points: size of the keyed subset of returns per frame; 0 means all.
       return_threshold_m: a predicted return is a predicted range above this.
       sampled: imagine with sampled latents; otherwise with their means.
+      batch_norm: "running" statistics, or those of each "batch" of windows, which takes the RSSM dropout with it; only
+        for comparison with the authors' figures, because a score then depends on what else is judged beside it.
+      pixel_chamfer: also the distance of the authors, of so many random pixels, holes included; 0 leaves it out.
+      scan_region_m: also scores along the rays of recorded scans (metrics/scans.py), inside this box, x, y, z of its
+        lowest and then of its highest corner as the lidar of the last observed frame sees it; () leaves them out.
+      scan_without_m: x, y of both corners of a box around the lidar whose returns are left out; () keeps all.
     """
 
     windows: Annotated[int, NOT_NEGATIVE] = 64
@@ -137,6 +144,16 @@ class EvaluationConfig:
     return_threshold_m: Annotated[float, at_least(0, "m")] = 1.0
     sampled: bool = False
     seed: Annotated[int, SEED] = 0
+    batch_norm: Literal["running", "batch"] = "running"
+    pixel_chamfer: Annotated[int, NOT_NEGATIVE] = 0
+    scan_region_m: tuple[float, ...] = ()
+    scan_without_m: tuple[float, ...] = ()
 
     def __post_init__(self):
         check(self)
+        for name, axes in (("scan_region_m", 3), ("scan_without_m", 2)):
+            box = getattr(self, name)
+            low, high = box[:axes], box[axes:]
+            if box and (len(box) != 2 * axes or not all(map(operator.lt, low, high))):
+                raise ValueError(f"evaluation.{name} is {list(box)}; expected {axes} numbers of a box's lowest corner, "
+                                 f"then {axes} larger ones of its highest, or none.")

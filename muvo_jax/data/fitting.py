@@ -30,13 +30,15 @@ class Adapted(NamedTuple):
     notes: tuple[str, ...]
 
 
-def adapt(config: config_lib.Config, recording: schema.Recording, *, keep: Collection[str] = ()) -> Adapted:
+def adapt(config: config_lib.Config, recording: schema.Recording, *, keep: Collection[str] = (),
+          splits: Collection[str] | None = None) -> Adapted:
     """Fits a config to a recording: sensor geometry, action contract, heads, inputs and window lengths.
 
     Adapting twice changes nothing more.
 
     Args:
       keep: dotted names, such as "data.stride", that the user chose; they are left alone.
+      splits: those that will be read, whose sequences must hold a window; None for all.
 
     Raises:
       DataError: where the recording lacks what every model needs (actions, and camera or lidar), its voxel grid
@@ -47,7 +49,7 @@ def adapt(config: config_lib.Config, recording: schema.Recording, *, keep: Colle
     contract = dataclasses.replace(description.contract, step_action=config.contract.step_action)
     model = _fit_first_guess(_fit_model(config.model, description, keep, notes), description, keep, notes)
     needs = prepare.needed(dataclasses.replace(config, model=model, contract=contract), description.modalities)
-    data = _fit_windows(config.data, recording, keep, needs, notes)
+    data = _fit_windows(config.data, recording, keep, needs, splits, notes)
     if description.route_map is not None:
         data = dataclasses.replace(data, route_map=description.route_map)
     train = config.train
@@ -227,8 +229,10 @@ def _by(shape: tuple[int, ...]) -> str:
 
 
 def _fit_windows(data: config_lib.DataConfig, recording: schema.Recording, keep: Collection[str],
-                 needs: Collection[str], notes: list[str]) -> config_lib.DataConfig:
-    lengths = {split: sequences.longest(recording.sequences, split, needs) for split in recording.description.splits}
+                 needs: Collection[str], splits: Collection[str] | None,
+                 notes: list[str]) -> config_lib.DataConfig:
+    lengths = {split: sequences.longest(recording.sequences, split, needs) for split in recording.description.splits
+               if splits is None or split in splits}
     if lengths.get("train", 0) < SHORT_RECORDING_FRAMES and _too_long(data, lengths):
         changes: dict = {name: value for name, value in _SHORT.items() if f"data.{name}" not in keep}
         data = dataclasses.replace(data, **changes)

@@ -93,12 +93,23 @@ class Frames:
         return np.stack([np.stack([self.get(window.sequence, index, judged=True)["action"] for index in window.indices])
                          for window in windows])
 
+    def scans(self, window: windows_lib.Window, start: int) -> list[np.ndarray]:
+        """The scans of a window from its frame `start` on, as recorded: float32 [P, 3] each, ego frame, m."""
+        read = functools.partial(_raw, self.recording, names=frozenset({"points_m"}))
+        return [read(window.sequence, index)["points_m"] for index in window.indices[start:]]
+
     def _make(self, sequence: schema.Sequence, index: int, names: frozenset[str]) -> prepare.PreparedFrame:
-        raw = (self.recording.read_fields(sequence, index, names) if isinstance(self.recording, schema.ReadsFields) else
-               self.recording.read(sequence, index))
+        raw = _raw(self.recording, sequence, index, names)
         for name in self._not_in_all:  # frames of one batch have the same fields
             raw.pop(name, None)  # type: ignore[misc]
         return prepare.prepare_frame(raw, self.config)
+
+
+def _raw(recording: schema.Recording, sequence: schema.Sequence, index: int, names: frozenset[str]) -> schema.RawFrame:
+    """A frame, of which only these fields are needed."""
+    if isinstance(recording, schema.ReadsFields):
+        return recording.read_fields(sequence, index, names)
+    return recording.read(sequence, index)
 
 
 class TrainBatches:
@@ -189,21 +200,33 @@ class EvaluationBatch:
 
 def evaluation_batches(frames: Frames, split: str, *, windows: int, length: int | None = None,
                        batch: int | None = None) -> Iterator[EvaluationBatch]:
-    """Yields at most `windows` windows of a split (0: all), evenly spread over it, in recorded order.
+    """Yields the windows of `evaluation_windows`.
 
     Args:
-      length: frames of a window, by default context + horizon.
+      windows, length: see there.
       batch: windows per batch, by default config.evaluation.batch.
 
     Raises:
-      DataError: for an unknown split or one without a window that long; at the call, not at the first batch.
+      DataError: see there; at the call, not at the first batch.
+    """
+    chosen = evaluation_windows(frames, split, windows=windows, length=length)
+    return _padded_batches(frames, chosen, batch or frames.config.evaluation.batch)
+
+
+def evaluation_windows(frames: Frames, split: str, *, windows: int,
+                       length: int | None = None) -> tuple[windows_lib.Window, ...]:
+    """At most `windows` windows of a split (0: all), evenly spread over it, in recorded order.
+
+    Args:
+      length: frames of a window, by default context + horizon.
+
+    Raises:
+      DataError: for an unknown split or one without a window that long.
     """
     data = frames.config.data
-    length = length or data.context + data.horizon
-    size = batch or frames.config.evaluation.batch
-    found = windows_lib.find_windows(frames.recording, split, frames=length, stride=data.stride, needs=frames.needs)
-    chosen = windows_lib.spread(found, windows)
-    return _padded_batches(frames, chosen, size)
+    found = windows_lib.find_windows(frames.recording, split, frames=length or data.context + data.horizon,
+                                     stride=data.stride, needs=frames.needs)
+    return windows_lib.spread(found, windows)
 
 
 def _padded_batches(frames: Frames, chosen: tuple[windows_lib.Window, ...], size: int) -> Iterator[EvaluationBatch]:

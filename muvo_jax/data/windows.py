@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import collections
 import dataclasses
+import hashlib
 import threading
 from collections.abc import Callable, Collection, Hashable
 
@@ -73,6 +74,13 @@ def spread(windows: tuple[Window, ...], count: int) -> tuple[Window, ...]:
         return windows
     picked = np.linspace(0, len(windows) - 1, count).round().astype(int)
     return tuple(windows[index] for index in picked)
+
+
+def fingerprint(windows: Collection[Window]) -> str:
+    """16 hexadecimal digits that name a list of windows: drives, first frames, lengths and strides, in order."""
+    lines = [f"{window.sequence.name} {window.sequence.start + window.start} {window.frames} {window.stride}"
+             for window in windows]
+    return hashlib.sha256("\n".join(lines).encode()).hexdigest()[:16]
 
 
 def others(windows: tuple[Window, ...]) -> tuple[Window, ...]:

@@ -8,7 +8,7 @@ import numpy as np
 
 from muvo_jax import head, types
 from muvo_jax.config import LastSeen, LossConfig, ModelConfig, VoxelGrid, as_kind
-from muvo_jax.metrics import baselines, occupancy, points, streaming
+from muvo_jax.metrics import baselines, occupancy, points, scans, streaming
 from muvo_jax.model import decoders, glimpse, tokens
 from muvo_jax.objectives import chamfer, labels, regression
 from muvo_jax.ops import range_view
@@ -66,8 +66,16 @@ def _sums(judged: head.Judged) -> dict[str, streaming.Sums]:
     distances = lambda above_m: points.frame_chamfer_m(
         judged.frames, np.asarray(judged.truth.range_view), seed=judged.seed, return_threshold_m=judged.threshold_m,
         points=judged.config.evaluation.chamfer_points, above_m=above_m)
-    return {"all": streaming.mean_sums(distances(-np.inf)),
-            "above": streaming.mean_sums(distances(occupancy.ABOVE_ROAD_M))}
+    scores = {"all": distances(-np.inf), "above": distances(occupancy.ABOVE_ROAD_M)}
+    evaluation = judged.config.evaluation
+    if evaluation.pixel_chamfer:
+        scores["pixels"] = points.pixel_chamfer_m(judged.frames, np.asarray(judged.truth.range_view),
+                                                  pixels=evaluation.pixel_chamfer, seed=judged.seed)
+    if judged.scans is not None:
+        scores |= scans.frame_scores(judged.frames, judged.scans, np.asarray(judged.truth.ego_motion),
+                                     geometry=judged.config.model.range_view, evaluation=evaluation,
+                                     threshold_m=judged.threshold_m)
+    return {name: streaming.mean_sums(values) for name, values in scores.items()}
 
 
 def _error(frames: np.ndarray, truth: types.Batch, grid: VoxelGrid) -> np.ndarray:
@@ -137,6 +145,14 @@ HEAD = head.Head(
         metrics={"chamfer_m": head.Metric("all", streaming.mean, "Chamfer", "m", 3, higher=False, on_screen=True,
                                           by_step=True, logged="imagined_chamfer_m", error=lambda metres: metres),
                  "chamfer_above_m": head.Metric("above", streaming.mean, "Chamfer above the road", "m", 3,
-                                                higher=False, on_screen=True)},
+                                                higher=False, on_screen=True),
+                 "chamfer_pixels_m": head.Metric("pixels", streaming.mean, "Chamfer of random pixels", "m", 3,
+                                                 higher=False, on_screen=True, by_step=True),
+                 "scan_chamfer_near_m2": head.Metric("near_m2", streaming.mean, "near-field Chamfer of scans", "m^2",
+                                                     3, higher=False, on_screen=True, by_step=True),
+                 "scan_l1_m": head.Metric("l1_m", streaming.mean, "L1 along rays", "m", 3, higher=False,
+                                          on_screen=True, by_step=True),
+                 "scan_absrel_percent": head.Metric("absrel_percent", streaming.mean, "AbsRel along rays", "%", 2,
+                                                    higher=False, on_screen=True, by_step=True)},
         pictures=(head.Picture("range", _draw_ranges, legend=("range",)),
                   head.Picture("points", _draw_points, "above", ("height",)))))

@@ -2,13 +2,15 @@
 
 Scores are kept per step and averaged, for the model and beside it for the baselines of baselines.py: copy-last and the
 moved last frames (of imagined steps only) and the training mean. A frame for which a score is undefined is counted and
-left out; what is undefined as a whole is NaN, never 0. BatchNorm runs on its running statistics.
+left out; what is undefined as a whole is NaN, never 0. BatchNorm runs on its running statistics, but for a comparison
+with the authors' figures (evaluation.batch_norm). cards.py has protocols by name.
 """
 
 from __future__ import annotations
 
+import dataclasses
 import functools
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -36,11 +38,14 @@ class Windows(NamedTuple):
       drives: of each real window the name of its drive.
       other_action: float32 [B, context + horizon, 2], of each window the actions of another one, of another drive
         where there is one; None to leave the answer to actions unmeasured.
+      scans: of each real window the recorded scans of the steps behind the context, float32 [P, 3] each; None where
+        no score asks for them (evaluation.scan_region_m).
     """
 
     batch: types.Batch
     drives: tuple[str, ...]
     other_action: types.ArrayLike | None = None
+    scans: Sequence[Sequence[np.ndarray]] | None = None
 
 
 Look = Callable[[Windows, Mapping[str, Mapping[str, baselines.Frames]]], None]
@@ -51,10 +56,13 @@ def identity(config: config_lib.Config) -> str:
     data, evaluation = config.data, config.evaluation
     frame_s = data.stride / config.contract.rate_hz
     latents = "sampled" if evaluation.sampled else "mean"
+    more = "" if evaluation.batch_norm == "running" else f", BatchNorm on each {evaluation.batch} windows' statistics"
+    more += f", Chamfer of {evaluation.pixel_chamfer} random pixels" if evaluation.pixel_chamfer else ""
+    more += f", scans inside {list(evaluation.scan_region_m)} m" if evaluation.scan_region_m else ""
     return (f"{VERSION}: context {data.context}, horizon {data.horizon}, {frame_s:g} s a step, Chamfer on "
             f"{evaluation.chamfer_points or 'all'} points, return above {evaluation.return_threshold_m:g} m, "
             f"occupied above {config.model.occupied_above:g}, {latents} latents, "
-            f"{_MOTION[config.contract.kinematics]}, seed {evaluation.seed}")
+            f"{_MOTION[config.contract.kinematics]}, seed {evaluation.seed}{more}")
 
 
 def predict(model: world_model.WorldModel, variables: types.Variables, key: types.Array, batch: types.Batch, *,
@@ -73,14 +81,20 @@ def predict(model: world_model.WorldModel, variables: types.Variables, key: type
       bool [B, context + horizon, X, Y, Z]}, for the heads that the model has; of optional heads as types.Batch holds
       what they predict.
     """
-    return jax.device_get(_predict(model, variables, key, batch, None, context, horizon, sampled)[0])
+    return jax.device_get(_predict(model, variables, key, batch, None, context, horizon, sampled, "running")[0])
 
 
-@functools.partial(jax.jit, static_argnums=(0, 5, 6, 7))
-def _predict(model, variables, key, batch, other_action, context, horizon, sampled):
+@functools.partial(jax.jit, static_argnums=(0, 5, 6, 7, 8))
+def _predict(model, variables, key, batch, other_action, context, horizon, sampled, batch_norm):
     """Frames of observed and imagined steps, and of the steps imagined under other actions (None without them)."""
     key_observe, key_imagine = jax.random.split(key)
-    observed = rollout.observe(model, variables, key_observe, batch.time_slice(0, context), sampled=sampled)
+    seen = batch.time_slice(0, context)
+    if batch_norm == "batch":
+        observed, _ = rollout.observe_window(_without_dropout(model), variables, seen,
+                                             rollout.sample_keys(key_observe, batch.batch_size), train=True,
+                                             sampled=sampled)
+    else:
+        observed = rollout.observe(model, variables, key_observe, seen, sampled=sampled)
     steps = slice(context - 1, context + horizon - 1)
     plans = [batch.action[:, steps]] + ([] if other_action is None else [other_action[:, steps]])
     dream = rollout.imagine(model, variables, key_imagine, observed.last, jnp.stack(plans, axis=1), sampled=sampled,
@@ -91,6 +105,14 @@ def _predict(model, variables, key, batch, other_action, context, horizon, sampl
     end = context + horizon
     return ({name: value[:, :end] for name, value in frames.items()},
             None if other_action is None else {name: value[:, end:] for name, value in frames.items()})
+
+
+def _without_dropout(model: world_model.WorldModel) -> world_model.WorldModel:
+    """As it trains, but for the dropout of its transformers."""
+    fusion = model.config.fusion
+    if isinstance(fusion, config_lib.TransformerFusion):
+        fusion = dataclasses.replace(fusion, dropout=0.0)
+    return world_model.WorldModel(dataclasses.replace(model.config, fusion=fusion))
 
 
 def shown_heads(config: config_lib.ModelConfig) -> tuple[str, ...]:
@@ -124,9 +146,10 @@ def evaluate(model: world_model.WorldModel | None, variables: types.Variables | 
     """
     judge = _Judge(config, training_mean, sources, look)
     key = jax.random.key(config.evaluation.seed)
-    data, sampled = config.data, config.evaluation.sampled
+    data, evaluation = config.data, config.evaluation
     dispatched = ((index, item, _predict(model, variables, jax.random.fold_in(key, index), item.batch,
-                                         item.other_action, data.context, data.horizon, sampled)
+                                         item.other_action, data.context, data.horizon, evaluation.sampled,
+                                         evaluation.batch_norm)
                    if "model" in sources else None) for index, item in enumerate(windows))
     for index, item, future in _one_ahead(dispatched):  # the device predicts while the host scores
         judge.add(index, item, jax.device_get(future))
@@ -165,11 +188,12 @@ class _Judge:
         for phase, (start, stop) in steps.items():
             part = truth.time_slice(start, stop)
             movers = self._movers_of(part, moved.get("warp_last", {}) if phase == "imagined" else {})
+            scans = item.scans if phase == "imagined" else None
             for source, guess in guesses[phase].items():
                 threshold_m = self._config.evaluation.return_threshold_m if source == "model" else 0.0
                 self._tallies[phase].setdefault(source, tally.Tally(self._config)).add(
                     guess, part, item.drives, seed=(self._config.evaluation.seed, index, start),
-                    threshold_m=threshold_m, movers=movers)
+                    threshold_m=threshold_m, movers=movers, scans=scans)
         self._windows += count
         self._drives.update(item.drives)
 

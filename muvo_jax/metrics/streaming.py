@@ -60,7 +60,7 @@ class DriveSums:
 
 
 def summary(sums: DriveSums, score: Score, seed: int) -> dict[str, Any]:
-    """JSON-ready {"mean", "interval", "per_step"} of a score.
+    """JSON-ready {"mean", "interval", "per_step", "to_step"} of a score.
 
     Args:
       score: named sums of any one shape -> scores of that shape, NaN where undefined.
@@ -68,7 +68,7 @@ def summary(sums: DriveSums, score: Score, seed: int) -> dict[str, Any]:
 
     Returns:
       "mean" is the score of all steps together, "interval" [low, high] holds it in 95 % of the draws of drives (NaN
-      with fewer than two drives), "per_step" has the score of each step.
+      with fewer than two drives), "per_step" has the score at each step, "to_step" that of all steps up to each.
     """
     over_steps = lambda values: {name: value.sum(axis=-1) for name, value in values.items()}
     total = sums.total()
@@ -78,7 +78,9 @@ def summary(sums: DriveSums, score: Score, seed: int) -> dict[str, Any]:
         drawn = drawn[~np.isnan(drawn)]
         if len(drawn):
             interval = np.quantile(drawn, INTERVAL).tolist()
-    return {"mean": float(score(over_steps(total))), "interval": interval, "per_step": score(total).tolist()}
+    up_to = {name: np.cumsum(value, axis=-1) for name, value in total.items()}
+    return {"mean": float(score(over_steps(total))), "interval": interval, "per_step": score(total).tolist(),
+            "to_step": score(up_to).tolist()}
 
 
 def mean_sums(values: np.ndarray) -> dict[str, np.ndarray]:

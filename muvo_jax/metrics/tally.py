@@ -21,18 +21,20 @@ class Tally:
         self._sums: dict[tuple[str, str], streaming.DriveSums] = {}
 
     def add(self, prediction: Mapping[str, np.ndarray], truth: types.Batch, drives: Sequence[str], *,
-            seed: tuple[int, ...], threshold_m: float, movers: np.ndarray | None = None) -> None:
+            seed: tuple[int, ...], threshold_m: float, movers: np.ndarray | None = None,
+            scans: Sequence[Sequence[np.ndarray]] | None = None) -> None:
         """Scores frames [B, steps, ...] against the recorded ones; a head that either lacks is not scored.
 
         Args:
           prediction: as protocol.predict returns it.
           truth: the same steps of the recording.
           drives: of each window [B].
-          seed, threshold_m, movers: see head.Judged.
+          seed, threshold_m, movers, scans: see head.Judged.
         """
         for name, frames in head_lib.shown(tuple(prediction)).items():
             if getattr(truth, frames.field) is not None:
-                judged = head_lib.Judged(np.asarray(prediction[name]), truth, self._config, seed, threshold_m, movers)
+                judged = head_lib.Judged(np.asarray(prediction[name]), truth, self._config, seed, threshold_m, movers,
+                                         scans)
                 for part, sums in frames.sums(judged).items():
                     self._sums.setdefault((name, part), streaming.DriveSums()).add(drives, sums)
 

@@ -69,6 +69,21 @@ def nearest_points(points_m: np.ndarray, geometry: config_lib.RangeViewGeometry)
     return _nearest(check_points(points_m), geometry).winner.reshape(geometry.rows, geometry.columns)
 
 
+def pixels_of(points_m: np.ndarray, geometry: config_lib.RangeViewGeometry) -> tuple[np.ndarray, np.ndarray]:
+    """Where `project` puts each of the points [P, 3] (ego frame, m).
+
+    Returns:
+      The number of its pixel, row by row, intp [P], -1 for a point exactly at the lidar; and its range, float64 [P], m.
+
+    Raises:
+      ValueError: for another shape or for points that are not finite.
+    """
+    points_m = check_points(points_m)
+    pixel, range_m = np.empty(len(points_m), np.intp), np.empty(len(points_m))
+    _fill_pixels(points_m, geometry, pixel, range_m)
+    return pixel, range_m
+
+
 class NearestOfCells:
     """The nearest point of each cell, of points that come in blocks; of equals the last wins.
 

@@ -72,9 +72,11 @@ class Validator:
 
 def windows(frames: pipeline.Frames, split: str, count: int) -> Iterator[protocol.Windows]:
     """At most `count` windows of a split (0: all) as `protocol.evaluate` takes them."""
+    wants_scans = bool(frames.config.evaluation.scan_region_m)
     for entry in pipeline.evaluation_batches(frames, split, windows=count):
         drives = tuple(window.sequence.name for window in entry.windows)
-        yield protocol.Windows(entry.batch, drives, frames.actions(entry.others))
+        scans = [frames.scans(window, frames.config.data.context) for window in entry.windows] if wants_scans else None
+        yield protocol.Windows(entry.batch, drives, frames.actions(entry.others), scans)
 
 
 def windows_of_run(run: run_lib.Run | str | os.PathLike, split: str | None = None, *, count: int,

@@ -28,6 +28,18 @@ def test_holes_take_no_part():
     np.testing.assert_allclose(distance, [[2.0]])
 
 
+def test_the_authors_distance_is_of_pixels_and_holes_are_points_at_the_origin():
+    """Two pixels of three are holes that a prediction of one such point has right: the distance shrinks to a third."""
+    truth = range_view((10, 0, 0, 10), (0, 0, 0, -1), (0, 0, 0, -1))
+    prediction = range_view((10, 3, 0, 10), (0, 0, 0, 0), (40, 0, 0, 40))
+    distance = points.pixel_chamfer_m(prediction, truth, pixels=9_000, seed=(0,))
+    shares = np.bincount(np.random.default_rng((0, 0, 0)).integers(0, 3, 9_000), minlength=3) / 9_000
+    to_truth, to_prediction = shares @ [3.0, 0.0, 30.0], shares @ [3.0, 0.0, 0.0]
+    np.testing.assert_allclose(distance, [[(to_truth + to_prediction) / 2]])
+    np.testing.assert_array_equal(points.pixel_chamfer_m(truth, truth, pixels=9, seed=(0,)), [[0.0]])
+    assert np.isnan(points.pixel_chamfer_m(truth * np.nan, truth, pixels=9, seed=(0,))).all()
+
+
 def test_an_empty_side_is_undefined_and_not_averaged():
     truth = np.concatenate([range_view((1, 0, 0, 1)), range_view((0, 0, 0, -1))], axis=1)
     prediction = np.concatenate([range_view((2, 0, 0, 2))] * 2, axis=1)

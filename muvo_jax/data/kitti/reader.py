@@ -10,7 +10,8 @@ forward speed, forward acceleration and yaw rate are used.
 
 KITTI records neither pedals nor steering wheel: actions are derived from the motion by a bicycle model, and the
 contract says so. There is no route map, no reward and no second town: the first two thirds of each drive train, the
-last third validates. The few returns of the recording car itself are left out.
+last third validates. Drives that the odometry benchmark calls 08, 09 and 10 are the split "test", by which lidar
+forecasts are compared (the card kitti-4docc-1s). The few returns of the recording car itself are left out.
 """
 
 from __future__ import annotations
@@ -38,6 +39,11 @@ LIDAR = config_lib.RangeViewGeometry(rows=64, columns=2048, elevation_min_rad=ma
                                      elevation_max_rad=math.radians(3.0), position_m=(0.0, 0.0, LIDAR_HEIGHT_M))
 CONTRACT = config_lib.ActionContract(wheelbase_m=2.71, rate_hz=10.0, kinematics="bicycle", source="derived")
 _DRIVE = re.compile(r"\d{4}_\d{2}_\d{2}_drive_\d{4}_sync")
+# First and last frame of sequences 08, 09 and 10, as the benchmark's devkit lists them.
+TEST = {"2011_09_30_drive_0028_sync": (1100, 5170), "2011_09_30_drive_0033_sync": (0, 1590),
+        "2011_09_30_drive_0034_sync": (0, 1200)}
+_NOTE_TEST = ("KITTI: drives 2011_09_30 0028, 0033 and 0034, sequences 08 to 10 of the odometry benchmark, are split "
+              "\"test\".")
 _NOTE_SPLITS = ("KITTI: the first two thirds of each drive train, the last third is split \"val\"; there is no "
                 "domain-shift split.")
 _NOTE_ACTIONS = "KITTI: actions are derived from speed, acceleration and yaw rate (bicycle model), not recorded."
@@ -110,6 +116,8 @@ class KittiRecording:
         rate_hz = round(1.0 / period_s, 1)
         self.sequences = tuple(sequence for drive in self._drives.values()
                                for sequence in _cut(drive, period_s))
+        tested = [name in TEST for name in self._drives]
+        splits = (() if all(tested) else ("train", "val")) + (("test",) if any(tested) else ())
         modalities = {"speed_mps", "yaw_rate_radps", "pose", "action", "timestamp_s", "frame_id"}
         modalities |= {"image", "intrinsics", "camera_to_ego"} if camera in self._sensors else set()
         modalities |= {"points_m"} if "velodyne_points" in self._sensors else set()
@@ -117,7 +125,8 @@ class KittiRecording:
             name=", ".join(self._drives), kind="KITTI raw", rate_hz=rate_hz,
             camera=next(iter(self._drives.values())).camera, lidar=LIDAR if "points_m" in modalities else None,
             voxels=None, contract=dataclasses.replace(CONTRACT, rate_hz=rate_hz), modalities=frozenset(modalities),
-            splits=("train", "val"), notes=(_NOTE_SPLITS, _NOTE_ACTIONS))
+            splits=splits, notes=((_NOTE_SPLITS,) if "train" in splits else ()) + (
+                (_NOTE_TEST,) if "test" in splits else ()) + (_NOTE_ACTIONS,))
 
     def read(self, sequence: schema.Sequence, index: int) -> schema.RawFrame:
         """See schema.Recording."""
@@ -241,11 +250,15 @@ def _read_timestamps(path: pathlib.Path, frame_ids: np.ndarray, present: np.ndar
 
 
 def _cut(drive: _Drive, period_s: float) -> list[schema.Sequence]:
-    """The gap-free sequences of a drive, split at two thirds; warns of gaps."""
+    """The gap-free sequences of a drive, split at two thirds; of one that tests what is listed. Warns of gaps."""
+    name = drive.folder.resolve().name
     boundary = len(drive.present) * 2 // 3
     late = sequences.after_gap(drive.timestamps_s, period_s)
-    pieces = sequences.gap_free(drive.present, late | (np.arange(len(late)) == boundary))
-    name = drive.folder.resolve().name
+    used = drive.present
+    if name in TEST:
+        boundary, (first, last) = 0, TEST[name]
+        used = used & (drive.frame_ids >= first) & (drive.frame_ids <= last)
+    pieces = sequences.gap_free(used, late | (np.arange(len(late)) == boundary))
     sequences.warn_of_gaps(name, drive.present, drive.absent, late, len(pieces))
-    return [schema.Sequence(split="train" if start < boundary else "val", name=name, start=start, length=length)
-            for start, length in pieces]
+    split = lambda start: "test" if name in TEST else "train" if start < boundary else "val"
+    return [schema.Sequence(split=split(start), name=name, start=start, length=length) for start, length in pieces]

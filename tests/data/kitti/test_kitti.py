@@ -2,6 +2,7 @@
 
 import math
 import shutil
+import types
 import warnings
 
 import numpy as np
@@ -12,9 +13,11 @@ from PIL import Image
 
 from muvo_jax import config as config_lib
 from muvo_jax import presets
-from muvo_jax.data import ego_motion, fitting, prepare, schema, sources
+from muvo_jax.data import ego_motion, fitting, pipeline, prepare, schema, sources, windows
 from muvo_jax.data.kitti import reader as kitti_reader
+from muvo_jax.metrics import cards, protocol
 from muvo_jax.ops import camera as camera_ops
+from muvo_jax.training import validation
 
 
 @pytest.fixture
@@ -35,6 +38,33 @@ def test_two_thirds_train_and_the_rest_validates(drive):
     assert recording.description.splits == ("train", "val")
     assert any("no domain-shift" in note for note in recording.description.notes)
     assert recording.description.rate_hz == 10.0
+
+
+def test_drives_of_the_odometry_benchmark_test_as_the_card_of_4d_occ_lists_them(drive, monkeypatch):
+    name = "2011_09_30_drive_0034_sync"
+    shutil.copytree(drive, drive.parent / name)
+    monkeypatch.setitem(kitti_reader.TEST, name, (3, 9))
+    both = kitti_reader.KittiRecording(drive.parent)
+    assert [(s.split, s.name, s.start, s.length) for s in both.sequences] == [
+        ("train", writers.DRIVE, 0, 8), ("val", writers.DRIVE, 8, 4), ("test", name, 3, 7)]
+    assert both.description.splits == ("train", "val", "test")
+    assert any("08 to 10" in note for note in both.description.notes)
+    alone = kitti_reader.KittiRecording(drive.parent / name)
+    assert alone.description.splits == ("test",) and [s.split for s in alone.sequences] == ["test"]
+    assert not any("two thirds" in note for note in alone.description.notes)
+
+
+def test_the_card_of_4d_occ_has_the_samples_of_the_whole_drives():
+    class Whole:  # frames are numbered from 0
+        sequences = tuple(schema.Sequence("test", name, first, last - first + 1)
+                          for name, (first, last) in kitti_reader.TEST.items())
+        description = types.SimpleNamespace(splits=("test",))
+
+    card = cards.load("kitti-4docc-1s")
+    length = card.settings["data.context"] + card.settings["data.horizon"]
+    found = windows.find_windows(Whole, "test", frames=length, stride=card.requires["data.stride"])
+    assert card.samples["test"] == cards.Samples(len(found), windows.fingerprint(found))
+    assert card.samples["test"].fingerprint != windows.fingerprint(found[1:])
 
 
 def test_a_frame_in_the_ego_frame(drive):
@@ -247,3 +277,21 @@ def test_a_real_drive():
     ahead = (depth_m > 7) & (np.abs(points_m[:, 1]) < 1.0) & (np.abs(points_m[:, 2]) < 0.3)
     inside = (uv_px[ahead] > 0) & (uv_px[ahead] < [256, 64])
     assert inside.mean() > 0.95
+
+
+@pytest.mark.skipif(samples.KITTI is None, reason="no real KITTI drive here; name one by MUVO_KITTI=FOLDER")
+def test_a_real_drive_is_judged_by_the_card_of_4d_occ():
+    """What is moved with the car forecasts scans better than what stands still, along rays and inside the box."""
+    recording = sources.open_recording(samples.KITTI)
+    card = cards.load("kitti-4docc-1s")
+    config = card.applied(presets.town(), {"evaluation.windows": 1})
+    config = fitting.adapt(config, recording, keep=tuple(card.settings), splits=("train",)).config
+    assert not card.foreign(config, recording.description.kind)
+    report = protocol.evaluate(None, None, validation.windows(pipeline.Frames(recording, config), "train", 1), config,
+                               sources=("copy_last", "warp_last"))
+    imagined = cards.defined(card, report)["imagined"]
+    assert imagined["copy_last"].keys() == card.metrics.keys()
+    for name in card.metrics:
+        assert 0 < imagined["warp_last"][name]["mean"] < imagined["copy_last"][name]["mean"]
+    steps = imagined["copy_last"]["scan_l1_m"]
+    assert steps["to_step"] == pytest.approx(np.cumsum(steps["per_step"]) / np.arange(1, 6))

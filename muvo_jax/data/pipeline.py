@@ -188,12 +188,13 @@ class EvaluationBatch:
 
 
 def evaluation_batches(frames: Frames, split: str, *, windows: int, length: int | None = None,
-                       batch: int | None = None) -> Iterator[EvaluationBatch]:
+                       batch: int | None = None, process: int = 0, processes: int = 1) -> Iterator[EvaluationBatch]:
     """Yields at most `windows` windows of a split (0: all), evenly spread over it, in recorded order.
 
     Args:
       length: frames of a window, by default context + horizon.
       batch: windows per batch, by default config.evaluation.batch.
+      process, processes: yields batches `process`, `process + processes` and so on of all.
 
     Raises:
       DataError: for an unknown split or one without a window that long; at the call, not at the first batch.
@@ -203,12 +204,13 @@ def evaluation_batches(frames: Frames, split: str, *, windows: int, length: int 
     size = batch or frames.config.evaluation.batch
     found = windows_lib.find_windows(frames.recording, split, frames=length, stride=data.stride, needs=frames.needs)
     chosen = windows_lib.spread(found, windows)
-    return _padded_batches(frames, chosen, size)
+    return _padded_batches(frames, chosen, size, range(process * size, len(chosen), processes * size))
 
 
-def _padded_batches(frames: Frames, chosen: tuple[windows_lib.Window, ...], size: int) -> Iterator[EvaluationBatch]:
+def _padded_batches(frames: Frames, chosen: tuple[windows_lib.Window, ...], size: int,
+                    starts: range) -> Iterator[EvaluationBatch]:
     others = windows_lib.others(chosen)
-    for start in range(0, len(chosen), size):
+    for start in starts:
         real, beside = chosen[start:start + size], others[start:start + size]
         missing = size - len(real)
         yield EvaluationBatch(frames.batch(real + real[-1:] * missing, judged=True), len(real), real,

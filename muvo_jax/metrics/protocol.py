@@ -8,7 +8,8 @@ left out; what is undefined as a whole is NaN, never 0. BatchNorm runs on its ru
 from __future__ import annotations
 
 import functools
-from collections.abc import Collection, Iterable, Iterator, Mapping
+import itertools
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from typing import Any, NamedTuple
 
 import jax
@@ -41,6 +42,23 @@ class Windows(NamedTuple):
     batch: types.Batch
     drives: tuple[str, ...]
     other_action: types.ArrayLike | None = None
+
+
+def _alone(value: Any) -> list[Any]:
+    return [value]
+
+
+class Share(NamedTuple):
+    """Which windows of a split `evaluate` gets, where several processes judge it together.
+
+    Attributes:
+      process, processes: every `processes`-th batch, from `process` on.
+      gather: what each process has -> what all of them have; called once.
+    """
+
+    process: int = 0
+    processes: int = 1
+    gather: Callable[[Any], list[Any]] = _alone
 
 
 def identity(config: config_lib.Config) -> str:
@@ -103,7 +121,7 @@ def finish(predictions: types.Predictions, model: config_lib.ModelConfig) -> dic
 
 def evaluate(model: world_model.WorldModel | None, variables: types.Variables | None, windows: Iterable[Windows],
              config: config_lib.Config, training_mean: baselines.Frames | None = None, *,
-             sources: Collection[str] = SOURCES) -> dict[str, Any]:
+             sources: Collection[str] = SOURCES, share: Share = Share()) -> dict[str, Any]:
     """Scores a model and the baselines on the windows of one split.
 
     Args:
@@ -112,6 +130,7 @@ def evaluate(model: world_model.WorldModel | None, variables: types.Variables | 
       config: of the run; `data` and `evaluation` say how.
       training_mean: from baselines.TrainingMean.prediction, or None to leave that baseline out.
       sources: which of SOURCES to judge.
+      share: where `windows` are those of this process alone; the scores are of all.
 
     Returns:
       JSON-ready {"protocol", "windows", "drives", "observed": {source: scores}, "imagined": {source: scores},
@@ -123,10 +142,14 @@ def evaluate(model: world_model.WorldModel | None, variables: types.Variables | 
     data, sampled = config.data, config.evaluation.sampled
     dispatched = ((index, item, _predict(model, variables, jax.random.fold_in(key, index), item.batch,
                                          item.other_action, data.context, data.horizon, sampled)
-                   if "model" in sources else None) for index, item in enumerate(windows))
+                   if "model" in sources else None)
+                  for index, item in zip(itertools.count(share.process, share.processes), windows, strict=False))
     for index, item, future in _one_ahead(dispatched):  # the device predicts while the host scores
         judge.add(index, item, jax.device_get(future))
-    return judge.report()
+    first, *others = share.gather(judge)
+    for other in others:
+        first.merge(other)
+    return first.report()
 
 
 class _Judge:
@@ -165,6 +188,17 @@ class _Judge:
                     threshold_m=threshold_m, movers=movers)
         self._windows += count
         self._drives.update(item.drives)
+
+    def merge(self, other: _Judge) -> None:
+        """With what another one has seen."""
+        for phase, tallies in other._tallies.items():
+            for source, one in tallies.items():
+                self._tallies[phase].setdefault(source, tally.Tally(self._config)).merge(one)
+        self._answers.merge(other._answers)
+        self._windows += other._windows
+        self._unknown += other._unknown
+        self._drives |= other._drives
+        self._movers = self._movers or other._movers
 
     def report(self) -> dict[str, Any]:
         """See `evaluate`."""

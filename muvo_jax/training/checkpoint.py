@@ -105,7 +105,7 @@ class Checkpoints:
                 integrity.seal(folder)
             together.wait_for_all("the checkpoint is sealed")
         except Exception as error:  # Orbax and TensorStore raise OSError, ValueError or RuntimeError for a full disk
-            if jax.process_count() > 1 and (isinstance(error, jax.errors.JaxRuntimeError) or not together.is_first()):
+            if together.is_loss(error) or not together.is_first():
                 raise
             shutil.rmtree(folder, ignore_errors=True)
             self._discard_partial_saves()

@@ -119,7 +119,7 @@ def train(job: Job, show: screen.Screen) -> Outcome:
     with run_folder.claimed(job.folder):
         together.wait_for_all("the run folder is there")
         together.check_same({"settings": config.to_dict(), "data": origin, "run folder": job.folder.is_dir(),
-                             "package versions": checkpoint_meta.package_versions()})
+                             "--resume": job.resume, "package versions": checkpoint_meta.package_versions()})
         keeper = checkpoint.Checkpoints(job.folder, keep_last=config.train.keep_last, keep_best=config.train.keep_best)
         if job.resume:
             state, done, data_state = start.resume(keeper, show, config, ready, first)

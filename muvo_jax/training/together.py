@@ -11,6 +11,7 @@ import hashlib
 import json
 import os
 import pickle
+import re
 import signal
 import socket
 import sys
@@ -29,6 +30,7 @@ WAIT_FOR_ALL_S = 300.0  # for hosts that start late, as where images are still p
 _HEARTBEAT_S = 30  # a host that is silent for so long is lost
 _DAY_S = 24 * 3600  # hosts wait so long at the end for the first one, which evaluates
 _AUTO = "auto"
+_LOSS = re.compile("Gloo|NCCL|RCCL|coordination service|UNAVAILABLE|DEADLINE_EXCEEDED|ABORTED")
 _Value = TypeVar("_Value")
 
 
@@ -172,13 +174,18 @@ def check_same(facts: Mapping[str, Any]) -> None:
                          f"with the same command (--host aside), version and data, and a runs folder that all share.")
 
 
+def is_loss(error: BaseException) -> bool:
+    """Whether it looks as if another process was missing. JAX gives such errors no type of their own."""
+    return jax.process_count() > 1 and _LOSS.search(str(error)) is not None
+
+
 @contextlib.contextmanager
 def noticing_losses(resume_command: str) -> Iterator[None]:
     """Turns the error of a step that a host is missing from into a LostHostError."""
     try:
         yield
-    except jax.errors.JaxRuntimeError as error:
-        if jax.process_count() == 1 or "RESOURCE_EXHAUSTED" in str(error):
+    except (jax.errors.JaxRuntimeError, ValueError) as error:
+        if not is_loss(error):
             raise
         raise LostHostError(
             f"host {jax.process_index()}: what all {jax.process_count()} hosts compute together failed; most likely "

@@ -9,7 +9,9 @@ $KILL_AT names a moment at which the process kills itself: step, evaluation or s
 import os
 import signal
 import sys
+import time
 
+import jax
 import test_loop
 
 from muvo_jax import recordings, train
@@ -47,6 +49,8 @@ def stopping(log):
         if record["kind"] == "train" and record["step"] == int(os.environ.get("STOP_AT", "0")):
             for _ in range(2):
                 os.kill(os.getpid(), signal.SIGTERM)
+            if jax.process_count() > 1:
+                time.sleep(2.0)  # JAX looks for the signal every second
 
     return logged
 
@@ -54,6 +58,7 @@ def stopping(log):
 if __name__ == "__main__":
     world_model.WorldModel = test_loop.SmallWorld
     recordings.open_configured = lambda config, progress=None, split=None: Recording()
+    train.draw_preview = train.draw_curves = lambda *_: None
     step_lib.SpreadFunction.__call__ = dying(step_lib.SpreadFunction.__call__, "step")
     validation.Validator.run = dying(validation.Validator.run, "evaluation")
     integrity.seal = dying(integrity.seal, "save")

@@ -355,7 +355,8 @@ def draw_curves(folder: pathlib.Path) -> None:
 
 
 def main() -> int:
-    return together.leave(command_line.run(Options, train, program="train", examples=EXAMPLES, trains=True))
+    code = command_line.run(Options, train, program="train", examples=EXAMPLES, trains=True)
+    return together.leave(code)
 
 
 if __name__ == "__main__":

@@ -62,13 +62,13 @@ class Checkpoints:
         self.folder = self.run_folder / FOLDER
         self._policy = _preservation.AnyPreservationPolicy([
             _preservation.LatestN(max(2, keep_last)),
-            _preservation.BestN(get_metric_fn=lambda metrics: metrics["score"], n=keep_best,
-                                keep_checkpoints_without_metrics=False)])
+            _preservation.BestN(get_metric_fn=_score, n=keep_best, keep_checkpoints_without_metrics=False)])
         self._manager = self._open()
 
     def _open(self) -> ocp.CheckpointManager:
         options = ocp.CheckpointManagerOptions(preservation_policy=self._policy, enable_async_checkpointing=False,
-                                               create=True, cleanup_tmp_directories=True)
+                                               create=True, cleanup_tmp_directories=True,
+                                               best_fn=_score)  # or scores would not be there when a run goes on
         return ocp.CheckpointManager(self.folder, options=options, item_names=("variables", "training", "meta"))
 
     def steps(self) -> list[int]:
@@ -248,6 +248,10 @@ def _candidates(checkpoints: pathlib.Path, found: list[int], which: int | str) -
     if which not in found:
         raise CheckpointError(f"{checkpoints} has no step {which}; it has {', '.join(map(str, found))}.")
     return [int(which)]
+
+
+def _score(metrics: Mapping[str, float]) -> float:
+    return metrics["score"]
 
 
 def _quiet() -> None:

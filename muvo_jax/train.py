@@ -7,6 +7,7 @@ import itertools
 import pathlib
 import shlex
 import sys
+import traceback
 from collections.abc import Mapping, Sequence
 from typing import Annotated, Any
 
@@ -355,7 +356,11 @@ def draw_curves(folder: pathlib.Path) -> None:
 
 
 def main() -> int:
-    code = command_line.run(Options, train, program="train", examples=EXAMPLES, trains=True)
+    try:
+        code = command_line.run(Options, train, program="train", examples=EXAMPLES, trains=True)
+    except Exception:  # at the interpreter's end this host would wait for others that wait for it
+        traceback.print_exc()
+        code = 1
     return together.leave(code)
 
 

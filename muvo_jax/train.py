@@ -7,6 +7,7 @@ import itertools
 import pathlib
 import shlex
 import sys
+import traceback
 from collections.abc import Mapping, Sequence
 from typing import Annotated, Any
 
@@ -21,7 +22,7 @@ with late.imports():
     from muvo_jax.interop import backbones
     from muvo_jax.metrics import protocol
     from muvo_jax.objectives import perceptual
-    from muvo_jax.training import checkpoint, loop, run_folder, screen, start, validation
+    from muvo_jax.training import checkpoint, loop, run_folder, screen, start, together, validation
     from muvo_jax.viz import curves, sheets
 
 PERCEPTUAL_WEIGHT = 0.1  # the reference's
@@ -114,6 +115,13 @@ class Options:
     """Of initialisation, order of the data and sampling."""
     parallel: Annotated[str | None, command_line.shown("{auto,pmap,shard_map}")] = None
     """How devices share a batch: auto takes shard_map where there is more than one."""
+    hosts: Annotated[str | None, command_line.shown("{N,auto}", "this process alone")] = None
+    """Train together with other processes, each started with this command (docs/cluster.md): how many, or auto in a job
+    of SLURM, Kubernetes, Open MPI or Cloud TPU, which says the rest too."""
+    host: Annotated[int | None, command_line.shown("INDEX", "none")] = None
+    """Which of them this one is, from 0."""
+    coordinator: Annotated[str | None, command_line.shown("ADDRESS:PORT", "none")] = None
+    """Of host 0, a free port there; the same for all."""
     trace: bool = False
     """Let JAX's profiler trace five steps into RUN/trace (for XProf or Perfetto)."""
     evaluate: bool = True
@@ -131,6 +139,7 @@ python -m muvo_jax.train --name=town-tr --resume --steps=800  (goes on with a ru
 python -m muvo_jax.train --init=runs/town-tr --data=/data/kitti_raw  (starts from its weights)
 python -m muvo_jax.train --preset=paper-occupancy --batch=1 --accumulate=1 --steps=1 --no-evaluate
 python -m muvo_jax.train --set loss.kl=0.01 model.fusion.dropout=0.0
+python -m muvo_jax.train --batch=16 --hosts=2 --host=0 --coordinator=10.0.0.1:1234  (and --host=1 on another machine)
 """
 
 
@@ -276,15 +285,22 @@ def default_name(options: Options) -> str:
 
 def train(options: Options, show: screen.Screen) -> None:
     """Does what the command line asks for."""
+    launch = together.launch_of(options.hosts, options.host, options.coordinator)
+    if launch is not None:
+        together.join(launch, show)
     config, chosen, folder = configure(options)
     elsewhere = [f"--runs-dir={options.runs_dir}"] if options.runs_dir != pathlib.Path("runs") else []
     resume_command = shlex.join(["python", "-m", "muvo_jax.train", f"--name={folder.name}", "--resume", *elsewhere])
     visible = bool(protocol.shown_heads(config.model))
-    outcome = loop.train(loop.Job(
-        config=config, folder=folder, open_recording=lambda: command_line.open_data(config, show), chosen=tuple(chosen),
-        resume=options.resume, resume_command=resume_command, started_s=command_line.process_start_s(),
-        init=options.init, pretrained=_pretrained(config, options.resume), frozen=frozen_encoder(config),
-        preview=draw_preview if visible else None, trace=options.trace), show)
+    with together.noticing_losses(resume_command):
+        outcome = loop.train(loop.Job(
+            config=config, folder=folder, open_recording=lambda: command_line.open_data(config, show),
+            chosen=tuple(chosen), resume=options.resume, resume_command=resume_command,
+            started_s=command_line.process_start_s(), init=options.init,
+            pretrained=_pretrained(config, options.resume), frozen=frozen_encoder(config),
+            preview=draw_preview if visible else None, trace=options.trace), show)
+    if not together.is_first():
+        return
     draw_curves(folder)
     if not visible:
         show.line("no head shows anything: there is nothing to draw or to judge.")
@@ -340,7 +356,12 @@ def draw_curves(folder: pathlib.Path) -> None:
 
 
 def main() -> int:
-    return command_line.run(Options, train, program="train", examples=EXAMPLES, trains=True)
+    try:
+        code = command_line.run(Options, train, program="train", examples=EXAMPLES, trains=True)
+    except Exception:  # at the interpreter's end this host would wait for others that wait for it
+        traceback.print_exc()
+        code = 1
+    return together.leave(code)
 
 
 if __name__ == "__main__":

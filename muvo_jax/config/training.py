@@ -92,6 +92,8 @@ class TrainConfig:
       restart: the observed frames of a training window are cut in two at a frame drawn anew in each step, so that the
         filter is trained on 1 to observe_frames of them.
       parallel: "auto" uses shard_map over all devices where there is more than one.
+      non_finite: what a batch does whose loss or gradient is not finite; none changes a parameter. "stop" ends the run
+        with an error, "skip" goes on and counts it in metrics.jsonl (ten in a row are an error too).
       trainable: paths of the parameters that train, as patterns separated by commas: "decoders_*" trains the decoders
         alone, "!camera" all but the camera's encoder, "*" everything (see training/trainable.py).
       backbone_weights: file of an image network that fresh encoders start from; "" for none.
@@ -109,6 +111,7 @@ class TrainConfig:
     keep_last: Annotated[int, NOT_NEGATIVE] = 2
     keep_best: Annotated[int, NOT_NEGATIVE] = 1
     parallel: Literal["auto", "pmap", "shard_map"] = "auto"
+    non_finite: Literal["stop", "skip"] = "stop"
     remat: bool = False
     decode_frames: Annotated[int, NOT_NEGATIVE] = 0
     observe_frames: Annotated[int, NOT_NEGATIVE] = 0

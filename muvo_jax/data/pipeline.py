@@ -199,18 +199,20 @@ class EvaluationBatch:
 
 
 def evaluation_batches(frames: Frames, split: str, *, windows: int, length: int | None = None,
-                       batch: int | None = None) -> Iterator[EvaluationBatch]:
+                       batch: int | None = None, process: int = 0, processes: int = 1) -> Iterator[EvaluationBatch]:
     """Yields the windows of `evaluation_windows`.
 
     Args:
       windows, length: see there.
       batch: windows per batch, by default config.evaluation.batch.
+      process, processes: yields batches `process`, `process + processes` and so on of all.
 
     Raises:
       DataError: see there; at the call, not at the first batch.
     """
     chosen = evaluation_windows(frames, split, windows=windows, length=length)
-    return _padded_batches(frames, chosen, batch or frames.config.evaluation.batch)
+    size = batch or frames.config.evaluation.batch
+    return _padded_batches(frames, chosen, size, range(process * size, len(chosen), processes * size))
 
 
 def evaluation_windows(frames: Frames, split: str, *, windows: int,
@@ -229,9 +231,10 @@ def evaluation_windows(frames: Frames, split: str, *, windows: int,
     return windows_lib.spread(found, windows)
 
 
-def _padded_batches(frames: Frames, chosen: tuple[windows_lib.Window, ...], size: int) -> Iterator[EvaluationBatch]:
+def _padded_batches(frames: Frames, chosen: tuple[windows_lib.Window, ...], size: int,
+                    starts: range) -> Iterator[EvaluationBatch]:
     others = windows_lib.others(chosen)
-    for start in range(0, len(chosen), size):
+    for start in starts:
         real, beside = chosen[start:start + size], others[start:start + size]
         missing = size - len(real)
         yield EvaluationBatch(frames.batch(real + real[-1:] * missing, judged=True), len(real), real,

@@ -39,6 +39,11 @@ class Answers:
             self._sums.setdefault(head, streaming.DriveSums()).add(
                 drives, {"recorded": error, "other": under_other[head]})
 
+    def merge(self, other: Answers) -> None:
+        """With the errors in other windows."""
+        for head, sums in other._sums.items():
+            self._sums.setdefault(head, streaming.DriveSums()).merge(sums)
+
     def ratios(self) -> dict[str, dict[str, Any]]:
         """{head: {"mean", "interval", "per_step"}} of the action shuffle ratio, NaN where nothing is wrong at all."""
         ratio = lambda sums: streaming.divide_or_nan(sums["other"], sums["recorded"])

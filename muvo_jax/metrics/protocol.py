@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import itertools
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
@@ -49,6 +50,23 @@ class Windows(NamedTuple):
 
 
 Look = Callable[[Windows, Mapping[str, Mapping[str, baselines.Frames]]], None]
+
+
+def _alone(value: Any) -> list[Any]:
+    return [value]
+
+
+class Share(NamedTuple):
+    """Which windows of a split `evaluate` gets, where several processes judge it together.
+
+    Attributes:
+      process, processes: every `processes`-th batch, from `process` on.
+      gather: what each process has -> what all of them have; called once.
+    """
+
+    process: int = 0
+    processes: int = 1
+    gather: Callable[[Any], list[Any]] = _alone
 
 
 def identity(config: config_lib.Config) -> str:
@@ -128,7 +146,8 @@ def finish(predictions: types.Predictions, model: config_lib.ModelConfig) -> dic
 
 def evaluate(model: world_model.WorldModel | None, variables: types.Variables | None, windows: Iterable[Windows],
              config: config_lib.Config, training_mean: baselines.Frames | None = None, *,
-             sources: Collection[str] = SOURCES, look: Look | None = None) -> dict[str, Any]:
+             sources: Collection[str] = SOURCES, look: Look | None = None,
+             share: Share = Share()) -> dict[str, Any]:
     """Scores a model and the baselines on the windows of one split.
 
     Args:
@@ -138,6 +157,7 @@ def evaluate(model: world_model.WorldModel | None, variables: types.Variables | 
       training_mean: from baselines.TrainingMean.prediction, or None to leave that baseline out.
       sources: which of SOURCES to judge.
       look: called once with the first windows and what all sources make of them, {phase: {source: frames}}.
+      share: where `windows` are those of this process alone; the scores are of all.
 
     Returns:
       JSON-ready {"protocol", "windows", "drives", "observed": {source: scores}, "imagined": {source: scores},
@@ -150,10 +170,14 @@ def evaluate(model: world_model.WorldModel | None, variables: types.Variables | 
     dispatched = ((index, item, _predict(model, variables, jax.random.fold_in(key, index), item.batch,
                                          item.other_action, data.context, data.horizon, evaluation.sampled,
                                          evaluation.batch_norm)
-                   if "model" in sources else None) for index, item in enumerate(windows))
+                    if "model" in sources else None)
+                   for index, item in zip(itertools.count(share.process, share.processes), windows, strict=False))
     for index, item, future in _one_ahead(dispatched):  # the device predicts while the host scores
         judge.add(index, item, jax.device_get(future))
-    return judge.report()
+    first, *others = share.gather(judge)
+    for other in others:
+        first.merge(other)
+    return first.report()
 
 
 class _Judge:
@@ -196,6 +220,17 @@ class _Judge:
                     threshold_m=threshold_m, movers=movers, scans=scans)
         self._windows += count
         self._drives.update(item.drives)
+
+    def merge(self, other: _Judge) -> None:
+        """With what another one has seen."""
+        for phase, tallies in other._tallies.items():
+            for source, one in tallies.items():
+                self._tallies[phase].setdefault(source, tally.Tally(self._config)).merge(one)
+        self._answers.merge(other._answers)
+        self._windows += other._windows
+        self._unknown += other._unknown
+        self._drives |= other._drives
+        self._movers = self._movers or other._movers
 
     def report(self) -> dict[str, Any]:
         """See `evaluate`."""

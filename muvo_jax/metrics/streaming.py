@@ -36,6 +36,13 @@ class DriveSums:
             for name, value in values.items():
                 sums[name] = sums.get(name, 0.0) + np.asarray(value[row], np.float64)
 
+    def merge(self, other: DriveSums) -> None:
+        """With the sums of other windows."""
+        for drive, values in other._drives.items():
+            sums = self._drives.setdefault(drive, {})
+            for name, value in values.items():
+                sums[name] = sums.get(name, 0.0) + value
+
     @property
     def drives(self) -> int:
         """How many there are."""

@@ -38,6 +38,11 @@ class Tally:
                 for part, sums in frames.sums(judged).items():
                     self._sums.setdefault((name, part), streaming.DriveSums()).add(drives, sums)
 
+    def merge(self, other: Tally) -> None:
+        """With the scores of other windows."""
+        for key, sums in other._sums.items():
+            self._sums.setdefault(key, streaming.DriveSums()).merge(sums)
+
     def scores(self) -> dict[str, dict[str, Any]]:
         """{metric: {"mean", "interval", "per_step"}}, with "frames" and "undefined" of means over frames.
 

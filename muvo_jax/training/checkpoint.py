@@ -13,7 +13,7 @@ import logging
 import os
 import pathlib
 import shutil
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import jax
@@ -23,7 +23,7 @@ from muvo_jax import config as config_lib
 from muvo_jax import run as run_lib
 from muvo_jax import types
 from muvo_jax.model import world_model
-from muvo_jax.training import builtin, checkpoint_meta, integrity
+from muvo_jax.training import builtin, checkpoint_meta, integrity, together
 
 FOLDER = "checkpoints"
 _preservation = ocp.checkpoint_managers
@@ -53,7 +53,7 @@ class Restored:
 
 
 class Checkpoints:
-    """The checkpoints of one run: RUN/checkpoints/STEP."""
+    """The checkpoints of one run: RUN/checkpoints/STEP. Several processes call the same methods together."""
 
     def __init__(self, run_folder: str | os.PathLike, *, keep_last: int = 2, keep_best: int = 1):
         """Keeps the `keep_last` newest (at least two: a damaged one needs a predecessor) and the best by score."""
@@ -62,13 +62,13 @@ class Checkpoints:
         self.folder = self.run_folder / FOLDER
         self._policy = _preservation.AnyPreservationPolicy([
             _preservation.LatestN(max(2, keep_last)),
-            _preservation.BestN(get_metric_fn=lambda metrics: metrics["score"], n=keep_best,
-                                keep_checkpoints_without_metrics=False)])
+            _preservation.BestN(get_metric_fn=_score, n=keep_best, keep_checkpoints_without_metrics=False)])
         self._manager = self._open()
 
     def _open(self) -> ocp.CheckpointManager:
         options = ocp.CheckpointManagerOptions(preservation_policy=self._policy, enable_async_checkpointing=False,
-                                               create=True, cleanup_tmp_directories=True)
+                                               create=True, cleanup_tmp_directories=True,
+                                               best_fn=_score)  # or scores would not be there when a run goes on
         return ocp.CheckpointManager(self.folder, options=options, item_names=("variables", "training", "meta"))
 
     def steps(self) -> list[int]:
@@ -97,26 +97,30 @@ class Checkpoints:
             meta=ocp.args.JsonSave(meta))
         folder = self.folder / str(step)
         try:
-            if folder.exists():  # an interrupted or damaged save of the same step
-                integrity.set_aside(folder, self.run_folder)
-                self._manager.reload()
+            if together.any_of(folder.exists()):  # an interrupted or damaged save of the same step
+                self.set_aside([step])
             self._manager.save(step, args=items, metrics=None if score is None else {"score": score}, force=True)
             self._manager.wait_until_finished()
-            integrity.seal(folder)
+            if together.is_first():
+                integrity.seal(folder)
+            together.wait_for_all("the checkpoint is sealed")
         except Exception as error:  # Orbax and TensorStore raise OSError, ValueError or RuntimeError for a full disk
+            if together.is_loss(error) or not together.is_first():
+                raise
             shutil.rmtree(folder, ignore_errors=True)
             self._discard_partial_saves()
             kept = [str(other) for other in self.steps() if integrity.damage(self.folder / str(other)) is None]
             raise CheckpointError(
                 f"checkpoint of step {step} could not be written to {self.folder}: {_first_line(error)}. "
-                f"Is the disk full? Readable checkpoints: {', '.join(kept) or 'none'}. Free some space and go on "
-                f"with --resume.") from error
+                f"Is the disk full, or the folder read-only? Readable checkpoints: {', '.join(kept) or 'none'}. Mend "
+                f"that and go on with --resume.") from error
         return folder
 
     def _discard_partial_saves(self) -> None:
         for path in self.folder.glob("*orbax-checkpoint-tmp*"):
             shutil.rmtree(path, ignore_errors=True)
-        self._manager = self._open()
+        if jax.process_count() == 1:  # several open it together, and the others are not here
+            self._manager = self._open()
 
     def restore_latest(self, like, config: config_lib.Config) -> Restored | None:
         """Restores the newest readable checkpoint onto the devices of `like`, whatever devices wrote it.
@@ -159,9 +163,12 @@ class Checkpoints:
         restored = self._manager.restore(step, args=items)
         return like.replace(**restored.variables, **restored.training)
 
-    def reload(self) -> None:
-        """Looks at the folder again, after something was moved out of it."""
+    def set_aside(self, steps: Sequence[int]) -> list[pathlib.Path]:
+        """Moves damaged checkpoints out of the way; returns where to, in the first process."""
+        moved = [integrity.set_aside(self.folder / str(step), self.run_folder) for step in steps if together.is_first()]
+        together.wait_for_all("damaged checkpoints are set aside")
         self._manager.reload()
+        return moved
 
     def close(self) -> None:
         self._manager.close()
@@ -193,7 +200,7 @@ def save_variables(run_folder: str | os.PathLike, step: int, variables: types.Va
 
 
 def load_run(run: str | os.PathLike, which: int | str = "latest") -> run_lib.Run:
-    """Loads a trained model for inference onto the first device, wherever it was trained.
+    """Loads a trained model for inference onto the first device of this process, wherever it was trained.
 
     Args:
       run: a run's folder, or "builtin:town" (training/builtin.py).
@@ -243,6 +250,10 @@ def _candidates(checkpoints: pathlib.Path, found: list[int], which: int | str) -
     return [int(which)]
 
 
+def _score(metrics: Mapping[str, float]) -> float:
+    return metrics["score"]
+
+
 def _quiet() -> None:
     """Orbax reports every step of its work, and warns of metadata that a single item does not have."""
     logging.getLogger("absl").setLevel(logging.ERROR)
@@ -250,18 +261,18 @@ def _quiet() -> None:
 
 def _restore_variables(folder: pathlib.Path) -> types.Variables:
     _quiet()
-    with ocp.StandardCheckpointer() as reader:
+    with ocp.StandardCheckpointer(multiprocessing_options=checkpoint_meta.alone()) as reader:
         target = jax.tree.map(_on_first_device, reader.metadata(folder).item_metadata.tree)
         return reader.restore(folder, target)
 
 
 def _on_first_device(leaf) -> jax.ShapeDtypeStruct:
-    sharding = jax.sharding.SingleDeviceSharding(jax.devices()[0])
+    sharding = jax.sharding.SingleDeviceSharding(jax.local_devices()[0])
     return jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=sharding)
 
 
 def _abstract(leaf):
-    sharding = getattr(leaf, "sharding", None) or jax.sharding.SingleDeviceSharding(jax.devices()[0])
+    sharding = getattr(leaf, "sharding", None) or jax.sharding.SingleDeviceSharding(jax.local_devices()[0])
     return jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=sharding)
 
 

@@ -9,6 +9,7 @@ import pathlib
 from collections.abc import Mapping
 from typing import Any
 
+import jax
 import orbax.checkpoint as ocp
 
 from muvo_jax import config as config_lib
@@ -33,12 +34,19 @@ def read(folder: pathlib.Path) -> dict[str, Any]:
     Raises:
       ValueError: for an unknown schema version.
     """
-    with ocp.Checkpointer(ocp.JsonCheckpointHandler()) as reader:
+    with ocp.Checkpointer(ocp.JsonCheckpointHandler(), multiprocessing_options=alone()) as reader:
         meta = reader.restore(folder / "meta")
     if meta["schema_version"] != SCHEMA_VERSION:
         raise ValueError(f"{folder} has checkpoint schema {meta['schema_version']}, this version reads "
                          f"{SCHEMA_VERSION}. It was written by muvo_jax {meta['packages'].get('muvo_jax')}: use that.")
     return meta
+
+
+def alone() -> ocp.options.MultiprocessingOptions:
+    """For Orbax: what this process reads it reads without the others, if there are any."""
+    process = jax.process_index()
+    return ocp.options.MultiprocessingOptions(primary_host=process, active_processes={process},
+                                              barrier_sync_key_prefix=f"alone_{process}")
 
 
 def read_data_state(meta: Mapping[str, Any]) -> Any:

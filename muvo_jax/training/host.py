@@ -1,12 +1,10 @@
-"""The process that trains: its memory, and the signals that ask it to stop."""
+"""The process that trains: its memory."""
 
 from __future__ import annotations
 
 import os
 import resource
-import signal
 import sys
-import threading
 
 TUNABLES_VARIABLE = "GLIBC_TUNABLES"
 
@@ -28,25 +26,3 @@ def restart_with_huge_pages() -> None:
         return
     environment = {**os.environ, TUNABLES_VARIABLE: "glibc.malloc.hugetlb=1"}
     os.execve(sys.executable, [sys.executable, *sys.orig_argv[1:]], environment)
-
-
-class StopRequest:
-    """Turns the first SIGINT or SIGTERM into a wish that the loop sees between two steps; a second one interrupts."""
-
-    def __init__(self):
-        self.requested = False
-        self._before: dict = {}
-
-    def __enter__(self) -> StopRequest:
-        if threading.current_thread() is threading.main_thread():
-            self._before = {number: signal.signal(number, self._handle) for number in (signal.SIGINT, signal.SIGTERM)}
-        return self
-
-    def __exit__(self, *_) -> None:
-        for number, handler in self._before.items():
-            signal.signal(number, handler)
-
-    def _handle(self, *_) -> None:
-        if self.requested:
-            raise KeyboardInterrupt
-        self.requested = True

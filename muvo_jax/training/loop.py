@@ -13,7 +13,6 @@ import math
 import pathlib
 import time
 from collections.abc import Callable, Collection, Iterator, Mapping
-from typing import NoReturn
 
 import jax
 
@@ -25,16 +24,18 @@ from muvo_jax.training import (
     checkpoint,
     checkpoint_meta,
     host,
+    opening,
     preparation,
     run_folder,
     screen,
     start,
     timing,
-    trainable,
+    together,
     validation,
 )
 
 _STEPS_LATE = 4  # a step is looked at when so many later ones run: what it copied to the host has arrived by then
+_MOST_SKIPPED = 10  # batches in a row: it is not the batches then
 
 Preview = Callable[[pathlib.Path, validation.Validator, types.Variables, str], None]
 
@@ -96,54 +97,59 @@ def train(job: Job, show: screen.Screen) -> Outcome:
     """
     if job.resume:
         checkpoint_meta.check_resumable(job.config, run_folder.read_config(job.folder), str(job.folder))
-    else:
+    elif together.is_first():
         run_folder.check_new(job.folder, job.resume_command)
     preparation.check_trainable(job.config)
     with concurrent.futures.ThreadPoolExecutor(1, "preparation") as background:
         early = background.submit(_prepare_early, job.config, job.frozen)
-        config, recording, making_s = _open_data(job, show)
+        trained = fitting.OF_TRAINED if job.resume or job.init else ()
+        config, recording, making_s = opening.open_data(job.config, job.open_recording, (*job.chosen, *trained), show)
         frames = pipeline.Frames(recording, config)
-        source = pipeline.train_batches(frames, seed=config.train.seed, batch=windows_per_step(config))
-        shapes = preparation.expected_batch(config, windows_per_step(config),
-                                            recorded=sequences.in_every_frame(recording))
+        source = _batches(frames, config)
+        shapes = preparation.expected_batch(config, _own_windows(config), recorded=sequences.in_every_frame(recording))
         ready = early.result()
         ready = (preparation.recompile(ready, config, shapes, job.frozen) if ready
                  else preparation.prepare(config, shapes, job.frozen))
-    _introduce(job, show, config, ready, source.windows_per_epoch)
+    opening.introduce(show, config, ready, source.windows_per_epoch, job.frozen, job.folder)
+    origin = opening.provenance(recording, config)
     first = functools.partial(start.first, job.init, job.pretrained, show, config, ready, frames)
     state, done, data_state = (None if job.resume else first()), 0, None
     if not job.resume:
         run_folder.create(job.folder, config, job.resume_command)
-    keeper = checkpoint.Checkpoints(job.folder, keep_last=config.train.keep_last, keep_best=config.train.keep_best)
-    if job.resume:
-        state, done, data_state = start.resume(keeper, show, config, ready, first)
-    if data_state is not None:
-        source = pipeline.train_batches(frames, seed=config.train.seed, batch=windows_per_step(config),
-                                        start_state=data_state)
-    run_folder.write_config(job.folder, config)
-    files = run_folder.RunFolder(job.folder, done)
-    validator = validation.Validator(ready.model, config, frames, job.frozen)
-    try:
-        run = _Run(job, show, config, ready, keeper, files, validator, state, done, provenance(recording, config))
-        return run.loop(source, making_s)
-    finally:
-        show.stop()
-        files.close()
-        keeper.close()
+    with run_folder.claimed(job.folder):
+        together.wait_for_all("the run folder is there")
+        together.check_same({"settings": config.to_dict(), "data": origin, "run folder": job.folder.is_dir(),
+                             "--resume": job.resume, "package versions": checkpoint_meta.package_versions()})
+        keeper = checkpoint.Checkpoints(job.folder, keep_last=config.train.keep_last, keep_best=config.train.keep_best)
+        if job.resume:
+            state, done, data_state = start.resume(keeper, show, config, ready, first)
+        if data_state is not None:
+            source = _batches(frames, config, data_state)
+        run_folder.write_config(job.folder, config)
+        files = run_folder.RunFolder(job.folder, done)
+        validator = validation.Validator(ready.model, config, frames, job.frozen)
+        try:
+            return _Run(job, show, config, ready, keeper, files, validator, state, done, origin).loop(source, making_s)
+        finally:
+            show.stop()
+            files.close()
+            keeper.close()
 
 
 def windows_per_step(config: config_lib.Config) -> int:
-    """Windows that one update sees, over all micro-batches and devices."""
+    """Windows that one update sees, over all micro-batches, devices and hosts."""
     return config.train.batch * config.optimizer.accumulate
 
 
-def provenance(recording: schema.Recording, config: config_lib.Config) -> dict:
-    """What a checkpoint remembers of its data."""
-    description = recording.description
-    frames = {split: sum(sequence.length for sequence in recording.sequences if sequence.split == split)
-              for split in description.splits}
-    return {"name": description.name, "kind": description.kind, "path": config.data.path, "frames": frames,
-            "rate_hz": description.rate_hz, "notes": list(description.notes)}
+def _own_windows(config: config_lib.Config) -> int:
+    """Windows of an update that this process reads."""
+    return windows_per_step(config) // jax.process_count()
+
+
+def _batches(frames: pipeline.Frames, config: config_lib.Config, start_state=None) -> pipeline.TrainBatches:
+    return pipeline.TrainBatches(frames, seed=config.train.seed, batch=windows_per_step(config),
+                                 start_state=start_state, process=jax.process_index(),
+                                 processes=jax.process_count(), accumulate=config.optimizer.accumulate)
 
 
 def _prepare_early(config: config_lib.Config,
@@ -151,43 +157,7 @@ def _prepare_early(config: config_lib.Config,
     """Compiles while the town is recorded: its sensors are the preset's. Other data must be looked at first."""
     if config.data.path != "town":
         return None
-    return preparation.prepare(config, preparation.expected_batch(config, windows_per_step(config)), frozen)
-
-
-def _open_data(job: Job, show: screen.Screen) -> tuple[config_lib.Config, schema.Recording, float]:
-    start_s = time.perf_counter()
-    recording = job.open_recording()
-    trained = fitting.OF_TRAINED if job.resume or job.init else ()
-    adapted = fitting.adapt(job.config, recording, keep=(*job.chosen, *trained))
-    fitting.check_targets(adapted.config, recording.description)
-    description = recording.description
-    counts = provenance(recording, adapted.config)["frames"]
-    show.field("data", f"{description.name} ({description.kind}, {description.rate_hz:g} Hz), frames: "
-                       + ", ".join(f"{split} {count}" for split, count in counts.items()))
-    for note in (*description.notes, *adapted.notes):
-        show.field("", note)
-    return adapted.config, recording, time.perf_counter() - start_s
-
-
-def _introduce(job: Job, show: screen.Screen, config: config_lib.Config, ready: preparation.Prepared,
-               windows: int) -> None:
-    data, accumulate = config.data, config.optimizer.accumulate
-    frame_s = data.stride / config.contract.rate_hz
-    show.field("windows", f"{windows} of {data.frames} frames, {frame_s:g} s apart; then {data.context} observed and "
-                          f"{data.horizon} imagined in evaluation")
-    show.field("model", f"{config.model.variant} ({config.model.latent.kind}), {ready.parameters:,} parameters, heads "
-                        f"{', '.join(config.model.heads)}")
-    if config.train.trainable != trainable.EVERYTHING:
-        params = ready.state.params
-        trained, _ = trainable.split(params, trainable.chosen(params, config.train.trainable))
-        numbers = sum(leaf.size for leaf in jax.tree.leaves(trained))
-        show.field("trains", f"{numbers:,} parameters ({config.train.trainable}); the rest is frozen")
-    extra = f" x {accumulate} accumulated" if accumulate > 1 else ""
-    batch = words.counted(config.train.batch, "window")
-    show.field("steps", f"{config.train.steps} of {batch}{extra}, {ready.step.plan.describe()}")
-    if job.frozen is not None:
-        show.field("perceptual", f"pictures are compared by {job.frozen.source}, frozen")
-    show.field("run", str(job.folder))
+    return preparation.prepare(config, preparation.expected_batch(config, _own_windows(config)), frozen)
 
 
 class _Run:
@@ -199,17 +169,20 @@ class _Run:
         self.job, self.show, self.config, self.ready = job, show, config, ready
         self.keeper, self.files, self.validator, self.origin = keeper, files, validator, origin
         self.state, self.done, self.saved = state, done, done if keeper.steps() else None
+        self.skipped = 0  # in a row
         self.step_times_s: list[float] = []
         self.spent = timing.Spent()
         self.unchecked: collections.deque[tuple[int, Mapping]] = collections.deque()
 
     def loop(self, source: pipeline.TrainBatches, making_s: float) -> Outcome:
         settings, pace = self.config.train, timing.Pace()
-        trace = timing.Trace(self.job.folder / run_folder.TRACE_FOLDER if self.job.trace else None)
-        feed = pipeline.prefetch_to_device(_Placed(source, self.ready.step.place))
-        with feed, host.StopRequest() as stop:
+        traced = self.job.trace and together.is_first()
+        trace = timing.Trace(self.job.folder / run_folder.TRACE_FOLDER if traced else None)
+        placed = _Placed(source, self.ready.step.place)
+        feed = pipeline.prefetch_to_device(placed, self.ready.step.plan.batch_sharding)
+        with feed, together.StopRequest() as stop:
             self.show.start(settings.steps, self.done)
-            while self.done < settings.steps and not stop.requested:
+            while self.done < settings.steps and not stop.after(self.done):
                 trace.begin(len(self.step_times_s))
                 start_s, waited_s = time.perf_counter(), feed.waited_s
                 batch = next(feed)
@@ -249,18 +222,23 @@ class _Run:
         """
         while len(self.unchecked) > late:
             step, metrics = self.unchecked.popleft()
-            if float(metrics["finite"]) != 1.0:
-                self._stop(step, metrics)
+            self.skipped = 0 if float(metrics["finite"]) == 1.0 else self.skipped + 1
+            if self.skipped:
+                self._not_finite(step, metrics)
 
-    def _stop(self, step: int, metrics: Mapping) -> NoReturn:
+    def _not_finite(self, step: int, metrics: Mapping) -> None:
         values = {name: float(value) for name, value in metrics.items()}
         bad = [f"{name} = {value}" for name, value in values.items() if not math.isfinite(value)]
         self.files.log({"kind": "non_finite", "step": step, **values})
+        if self.config.train.non_finite == "skip" and self.skipped < _MOST_SKIPPED:
+            self.show.warn(f"step {step}: the loss is not finite: {', '.join(bad)}. The batch is skipped.")
+            return
         raise NonFiniteLossError(
             f"step {step}: the loss is not finite: {', '.join(bad)}. "
             + (f"The last good checkpoint is of step {self.saved}, in {self.keeper.folder / str(self.saved)}."
                if self.saved is not None else "There is no checkpoint yet.")
-            + " Try a lower --learning-rate, or gradient clipping: --set optimizer.clip_norm=1.")
+            + " Try a lower --learning-rate, or gradient clipping: --set optimizer.clip_norm=1. Where few batches are "
+              "bad, --set train.non_finite=skip leaves them out.")
 
     def _first_loss(self, loss: float, making_s: float) -> None:
         ready = self.ready
@@ -306,7 +284,7 @@ class _Run:
         return mean if math.isfinite(mean) else None
 
     def _preview(self) -> None:
-        if self.job.preview is not None:
+        if self.job.preview is not None and together.is_first():
             with self.spent.on("pictures"):
                 self.job.preview(self.job.folder / run_folder.PREVIEW_FOLDER, self.validator, self.state.variables,
                                  f"step_{self.done:06d}")

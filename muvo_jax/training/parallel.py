@@ -53,7 +53,13 @@ class Plan:
         """Such as "shard_map over 8 cpu devices"."""
         if self.mode == "single":
             return f"one {self.devices[0].platform} device"
-        return f"{self.mode} over {len(self.devices)} {self.devices[0].platform} devices"
+        hosts = f" of {self.processes} hosts" if self.processes > 1 else ""
+        return f"{self.mode} over {len(self.devices)} {self.devices[0].platform} devices{hosts}"
+
+    @property
+    def batch_sharding(self) -> NamedSharding:
+        """Of what `place_batch` returns: micro-batch after micro-batch, each spread over the devices."""
+        return NamedSharding(self.mesh, PartitionSpec(None, AXIS))
 
 
 def make_plan(parallel: str, batch_size: int, devices: Sequence[jax.Device] | None = None) -> Plan:
@@ -71,7 +77,8 @@ def make_plan(parallel: str, batch_size: int, devices: Sequence[jax.Device] | No
         raise ValueError(f"parallel: got {parallel!r}, expected one of {', '.join(MODES)}.")
     if len({device.process_index for device in devices}) > 1:
         if parallel == "pmap":
-            raise ValueError("parallel=pmap works within one process; use parallel=shard_map (or auto) with several.")
+            raise ValueError("parallel=pmap works within one process; use parallel=shard_map (or auto) with several "
+                             "hosts.")
         parallel = "shard_map"
     if parallel == "auto":
         count = max(n for n in range(1, len(devices) + 1) if batch_size % n == 0)
@@ -103,6 +110,13 @@ def _on_all_processes(sharding: NamedSharding, leaf: types.ArrayLike) -> jax.Arr
     return jax.make_array_from_process_local_data(sharding, np.asarray(leaf))
 
 
+def on_device(state: Any, device: jax.Device) -> Any:
+    """The state on one device of this process, which has a copy of it."""
+    own = lambda leaf: (leaf.addressable_data(0) if isinstance(leaf, jax.Array) and not leaf.is_fully_addressable
+                        else leaf)
+    return jax.device_put(jax.tree.map(own, state), device)
+
+
 def place_batch(plan: Plan, batch: types.Batch, accumulate: int) -> types.Batch:
     """Splits a batch into micro-batches and spreads each of them over the devices.
 
@@ -124,10 +138,10 @@ def place_batch(plan: Plan, batch: types.Batch, accumulate: int) -> types.Batch:
                          f"devices; expected a multiple of {accumulate * devices}.")
     leading = (accumulate, devices, -1) if plan.mode == "pmap" else (accumulate, windows // accumulate)
     split = jax.tree.map(lambda leaf: leaf.reshape(*leading, *leaf.shape[1:]), batch)
-    sharding = NamedSharding(plan.mesh, PartitionSpec(None, AXIS))
     if plan.processes == 1:
-        return jax.device_put(split, sharding)
-    return jax.tree.map(lambda leaf: jax.make_array_from_process_local_data(sharding, np.asarray(leaf)), split)
+        return jax.device_put(split, plan.batch_sharding)
+    upload = functools.partial(jax.make_array_from_process_local_data, plan.batch_sharding)
+    return jax.tree.map(lambda leaf: upload(np.asarray(leaf)), split)
 
 
 def spread(plan: Plan, body: Body, *, donate_state: bool = False) -> Callable[[Any, types.Batch], Any]:

@@ -100,7 +100,7 @@ def prepare(config: config_lib.Config, batch_shapes: types.Batch,
 
     Args:
       config: of the run.
-      batch_shapes: [train.batch * optimizer.accumulate, frames, ...].
+      batch_shapes: [train.batch * optimizer.accumulate, frames, ...]; of several processes the part that each reads.
       frozen: the network of the perceptual term, where that is on.
 
     Raises:

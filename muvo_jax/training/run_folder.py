@@ -2,34 +2,45 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import math
 import os
 import pathlib
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import tensorboardX
 
 from muvo_jax import config as config_lib
-from muvo_jax.training import checkpoint
+from muvo_jax.data import processes
+from muvo_jax.training import checkpoint, together
 
 CONFIG_FILE = "config.json"
 METRICS_FILE = "metrics.jsonl"
+LOCK_FILE = ".training"
 PREVIEW_FOLDER = "previews"
 TRACE_FOLDER = "trace"
 
 
 class RunFolder:
-    """Files of one run. Records are appended line by line, so that a killed run loses none that it reported."""
+    """Files of one run. Records are appended line by line, so that a killed run loses none that it reported.
+
+    Of several processes the first one writes; in this module the others only read.
+    """
 
     def __init__(self, path: str | os.PathLike, first_step: int = 0):
         self.path = pathlib.Path(path).expanduser()
+        self._writes = together.is_first()
+        if not self._writes:
+            return
         self._events = tensorboardX.SummaryWriter(str(self.path), purge_step=first_step or None)
         self._metrics = (self.path / METRICS_FILE).open("a", encoding="utf-8")
 
     def log(self, record: Mapping[str, Any]) -> None:
         """Appends one record; finite numbers also go to TensorBoard as `kind/name`. What is not finite is null."""
+        if not self._writes:
+            return
         clean = {name: _json_number(value) for name, value in record.items()}
         self._metrics.write(json.dumps(clean) + "\n")
         self._metrics.flush()
@@ -39,8 +50,23 @@ class RunFolder:
                 self._events.add_scalar(f"{prefix}/{name}", value, record["step"])
 
     def close(self) -> None:
-        self._metrics.close()
-        self._events.close()
+        if self._writes:
+            self._metrics.close()
+            self._events.close()
+
+
+@contextlib.contextmanager
+def claimed(path: str | os.PathLike) -> Iterator[None]:
+    """Keeps another training out of an existing run's folder.
+
+    Raises:
+      BlockingIOError: where one is there now.
+    """
+    if not together.is_first():
+        yield
+        return
+    with processes.locked(pathlib.Path(path).expanduser() / LOCK_FILE, "training"):
+        yield
 
 
 def check_new(path: str | os.PathLike, again: str) -> None:
@@ -64,6 +90,8 @@ def check_new(path: str | os.PathLike, again: str) -> None:
 
 def create(path: str | os.PathLike, config: config_lib.Config, again: str) -> None:
     """Makes the folder of a new run and writes its config; refuses as `check_new` does."""
+    if not together.is_first():
+        return
     check_new(path, again)
     pathlib.Path(path).expanduser().mkdir(parents=True, exist_ok=True)
     write_config(path, config)
@@ -71,6 +99,8 @@ def create(path: str | os.PathLike, config: config_lib.Config, again: str) -> No
 
 def write_config(path: str | os.PathLike, config: config_lib.Config) -> None:
     """Writes RUN/config.json; the file is replaced as a whole."""
+    if not together.is_first():
+        return
     target = pathlib.Path(path).expanduser() / CONFIG_FILE
     partial = target.with_name(CONFIG_FILE + ".part")
     partial.write_text(json.dumps(config.to_dict(), indent=2) + "\n", encoding="utf-8")
@@ -109,6 +139,8 @@ def read_metrics(path: str | os.PathLike) -> list[dict[str, Any]]:
 
 def forget_after(path: str | os.PathLike, step: int) -> int:
     """Removes records of later steps, which a resumed run makes again; returns how many."""
+    if not together.is_first():
+        return 0
     records = read_metrics(path)
     kept = [record for record in records if record["step"] <= step]
     if len(kept) == len(records):

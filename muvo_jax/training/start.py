@@ -12,7 +12,6 @@ from muvo_jax.data import pipeline
 from muvo_jax.training import (
     checkpoint,
     first_guess,
-    integrity,
     preparation,
     run_folder,
     screen,
@@ -66,11 +65,8 @@ def resume(keeper: checkpoint.Checkpoints, show: screen.Screen, config: config_l
         return make_first(), 0, None
     for text in restored.warnings:
         show.warn(text)
-    later = [step for step in keeper.steps() if step > restored.step]
-    for step in later:
-        moved = integrity.set_aside(keeper.folder / str(step), folder)
+    for moved in keeper.set_aside([step for step in keeper.steps() if step > restored.step]):
         show.warn(f"moved the damaged checkpoint to {moved}.")
-    keeper.reload()
     run_folder.forget_after(folder, restored.step)
     show.field("resumed", f"from step {restored.step}")
     return restored.state, restored.step, restored.data_state

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import functools
+import itertools
 import os
 from collections.abc import Iterator, Mapping
 from typing import Any
@@ -17,7 +19,8 @@ from muvo_jax.data import fitting, pipeline, schema
 from muvo_jax.metrics import baselines, protocol, skill
 from muvo_jax.model import world_model
 from muvo_jax.objectives import perceptual
-from muvo_jax.training import checkpoint
+from muvo_jax.training import checkpoint, together
+from muvo_jax.training import parallel as parallel_lib
 from muvo_jax.training import state as state_lib
 from muvo_jax.training import step as step_lib
 
@@ -25,13 +28,17 @@ TRAINING_MEAN_FRAMES = 512
 
 
 class Validator:
-    """Validates on the first device; its functions are compiled once and shared with the final evaluation."""
+    """Validates on the first device; its functions are compiled once and shared with the final evaluation.
+
+    Several processes share the windows, batch by batch, and all of them get the numbers of all.
+    """
 
     def __init__(self, model: world_model.WorldModel, config: config_lib.Config, frames: pipeline.Frames,
                  frozen: perceptual.FrozenEncoder | None = None):
         self.model, self.config, self.frames = model, config, frames
         self.splits = tuple(split for split in frames.recording.description.splits if split != "train")
-        self._device = jax.devices()[0]
+        self._device = jax.local_devices()[0]
+        self._share = protocol.Share(jax.process_index(), jax.process_count(), together.gather)
         self._losses = step_lib.make_validation_step(model, config, batch_size=config.evaluation.batch,
                                                      devices=[self._device], frozen=frozen)
         self._baselines: dict[str, dict[str, Any]] = {}
@@ -43,16 +50,17 @@ class Validator:
         beside them, "copy_last_*" and so on; "action_shuffle_*" of each head (metrics/answers.py); "skill" of the
         imagined frames (metrics/skill.py).
         """
-        state = jax.device_put(state, self._device)
-        sums: dict[str, float] = {}
-        batches = list(windows(self.frames, split, self.config.train.validation_windows))
-        for item in batches:  # a window that fills a batch counts twice here: this is a monitor, not the report
-            for name, value in self._losses(state, item.batch).items():
-                sums[name] = sums.get(name, 0.0) + float(value) / len(batches)
-        report = protocol.evaluate(self.model, state.variables, batches, self.config, sources=("model",))
+        state = parallel_lib.on_device(state, self._device)
+        batches = list(windows(self.frames, split, self.config.train.validation_windows, self._share))
+        # A window that fills a batch counts twice here: this is a monitor, not the report.
+        losses = [{name: float(value) for name, value in self._losses(state, item.batch).items()} for item in batches]
+        losses = list(itertools.chain.from_iterable(self._share.gather(losses)))
+        sums = {name: sum(one[name] for one in losses) / len(losses) for name in losses[0]}
+        judge = functools.partial(protocol.evaluate, windows=batches, config=self.config, share=self._share)
+        report = judge(self.model, state.variables, sources=("model",))
         if split not in self._baselines:  # which see the same windows every time
             others = [source for source in protocol.SOURCES if source != "model"]
-            self._baselines[split] = protocol.evaluate(None, None, batches, self.config, sources=others)["imagined"]
+            self._baselines[split] = judge(None, None, sources=others)["imagined"]
         imagined = report["imagined"] | self._baselines[split]
         for source, scores in imagined.items():
             for name, metric in logged().items():
@@ -65,15 +73,18 @@ class Validator:
         """The first windows of a split, always the same, and what the model makes of them (protocol.predict)."""
         batch = next(windows(self.frames, split, self.config.evaluation.batch)).batch
         data, evaluation = self.config.data, self.config.evaluation
-        frames = protocol.predict(self.model, jax.device_put(variables, self._device), jax.random.key(evaluation.seed),
-                                  batch, context=data.context, horizon=data.horizon, sampled=evaluation.sampled)
+        variables = parallel_lib.on_device(variables, self._device)
+        frames = protocol.predict(self.model, variables, jax.random.key(evaluation.seed), batch, context=data.context,
+                                  horizon=data.horizon, sampled=evaluation.sampled)
         return batch, frames
 
 
-def windows(frames: pipeline.Frames, split: str, count: int) -> Iterator[protocol.Windows]:
-    """At most `count` windows of a split (0: all) as `protocol.evaluate` takes them."""
+def windows(frames: pipeline.Frames, split: str, count: int,
+            share: protocol.Share = protocol.Share()) -> Iterator[protocol.Windows]:
+    """At most `count` windows of a split (0: all) as `protocol.evaluate` takes them; of these a process's share."""
     wants_scans = bool(frames.config.evaluation.scan_region_m)
-    for entry in pipeline.evaluation_batches(frames, split, windows=count):
+    for entry in pipeline.evaluation_batches(frames, split, windows=count, process=share.process,
+                                             processes=share.processes):
         drives = tuple(window.sequence.name for window in entry.windows)
         scans = [frames.scans(window, frames.config.data.context) for window in entry.windows] if wants_scans else None
         yield protocol.Windows(entry.batch, drives, frames.actions(entry.others), scans)

@@ -48,6 +48,30 @@ def _evaluate(monkeypatch, config, predictions, batches, mean=None, other=None):
     return protocol.evaluate(None, None, windows, config, mean)
 
 
+def test_two_processes_that_share_the_windows_report_what_one_does(monkeypatch, config):
+    good, bad = _batch(), _batch()
+    bad.image[:] = 255 - bad.image
+    batches = [(good, 2), (bad, 1), (good, 1)]
+    answer = _perfect(_batch())
+    other = {name: value[:, CONTEXT:] for name, value in answer.items()}
+    alone = _evaluate(monkeypatch, config, [answer] * 3, batches, other=other)
+    seen = []
+
+    def judge(process, gather):
+        monkeypatch.setattr(protocol, "_predict", lambda *_: (answer, other))
+        windows = [protocol.Windows(batch, tuple(f"{index}-{row}" for row in range(count)))
+                   for index, (batch, count) in enumerate(batches)][process::2]
+        return protocol.evaluate(None, None, windows, config, share=protocol.Share(process, 2, gather))
+
+    judge(1, lambda value: seen.append(value) or [value])
+    together = judge(0, lambda value: [value, *seen])
+    assert (together["windows"], together["drives"]) == (alone["windows"], alone["drives"]) == (4, 4)
+    for phase in protocol.PHASES:
+        for source, scores in alone[phase].items():
+            for name, score in scores.items():
+                np.testing.assert_allclose(together[phase][source][name]["mean"], score["mean"], rtol=1e-12)
+
+
 def test_a_perfect_model_is_perfect_and_copy_last_falls_behind_step_by_step(monkeypatch, config):
     batch = _batch()
     report = _evaluate(monkeypatch, config, [_perfect(batch)], [(batch, 2)])

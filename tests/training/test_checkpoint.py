@@ -1,12 +1,14 @@
 """Checkpoints: exact round trips, and nothing lost when a file is damaged, the disk is full or the machine changes."""
 
 import dataclasses
+import errno
 import json
 import os
 import pathlib
 import subprocess
 import sys
 import textwrap
+import time
 
 import jax
 import jax.numpy as jnp
@@ -159,6 +161,9 @@ def test_keeps_the_last_and_the_best(tmp_path, fresh, config):
     keeper = checkpoint.Checkpoints(tmp_path, keep_last=2, keep_best=1)
     for step, score in ((1, 0.0), (2, 5.0), (3, 1.0), (4, None), (5, 2.0)):
         keeper.save(step, fresh, config=config, score=score)
+        if step == 3:  # the run goes on in another process
+            keeper.close()
+            keeper = checkpoint.Checkpoints(tmp_path, keep_last=2, keep_best=1)
     assert keeper.steps() == [2, 4, 5]
     keeper.close()
     assert checkpoint.load_run(tmp_path, "best").step == 2
@@ -243,6 +248,34 @@ def test_a_full_disk_leaves_the_checkpoint_before_and_says_so(tmp_path, fresh, c
     assert "checkpoint of step 2 could not be written" in message and "Readable checkpoints: 1." in message
     assert kept == "[1] 1"
     _assert_same(checkpoint.Checkpoints(tmp_path).restore_latest(fresh, config).state, _at(fresh, 1))
+
+
+def test_a_folder_that_cannot_be_written_is_told_and_what_is_there_stays(tmp_path, fresh, config, monkeypatch):
+    keeper = _save(tmp_path, fresh, config, 1)
+    with monkeypatch.context() as patch:
+        patch.setattr(integrity, "seal", lambda folder: (_ for _ in ()).throw(OSError(errno.EROFS, "Read-only")))
+        with pytest.raises(checkpoint.CheckpointError, match=r"step 2 .* Read-only.*or the folder read-only\?.*: 1\."):
+            keeper.save(2, _at(fresh, 2), config=config)
+    assert keeper.restore_latest(fresh, config).step == 1
+    keeper.save(2, _at(fresh, 2), config=config)
+    assert keeper.restore_latest(fresh, config).step == 2
+
+
+def test_a_clock_that_was_set_back_changes_nothing(tmp_path, fresh, config, monkeypatch):
+    now_s = time.time()
+    keeper = _save(tmp_path, fresh, config, 1, 2)
+    with monkeypatch.context() as patch:
+        patch.setattr(time, "time", lambda: now_s - 1e6)
+        patch.setattr(time, "time_ns", lambda: int((now_s - 1e6) * 1e9))
+        keeper.save(3, _at(fresh, 3), config=config)
+        keeper.close()
+    for step in (2, 3):
+        long_ago_s = now_s - 1e6 * step
+        os.utime(tmp_path / "checkpoints" / str(step), (long_ago_s, long_ago_s))
+    keeper = checkpoint.Checkpoints(tmp_path)
+    assert keeper.steps() == [1, 2, 3] and keeper.restore_latest(fresh, config).step == 3
+    keeper.save(4, _at(fresh, 4), config=config)
+    assert keeper.steps() == [1, 3, 4] and checkpoint.load_run(tmp_path).step == 4
 
 
 def test_run_folder_refuses_what_exists_and_forgets_later_records(tmp_path, config):

@@ -304,6 +304,40 @@ def test_whether_a_step_was_finite_is_read_late_and_for_every_step(tmp_path, mon
     assert reads == {1: 1, 2: 6, 3: 7} | dict.fromkeys(range(4, 9), 8) | dict.fromkeys(range(9, 13), 12)
 
 
+class Holed(MemoryRecording):
+    """Some training frames have an action that is no number."""
+
+    def action(self, sequence, index):
+        bad = sequence.split == "train" and index in self.bad
+        return super().action(sequence, index) * np.float32(np.nan if bad else 1.0)
+
+
+def _train_on(recording, bad, folder, **settings):
+    recording.bad = bad
+    job = loop.Job(config=_config(non_finite="skip", validate_every=0, **settings), folder=folder,
+                   open_recording=lambda: recording)
+    return loop.train(job, Interrupting())
+
+
+def test_batches_that_are_not_finite_are_skipped_and_counted_where_asked_for(tmp_path):
+    _train_on(Holed(), {0}, tmp_path / "run")
+    records = run_folder.read_metrics(tmp_path / "run")
+    skipped = {record["step"] for record in records if record["kind"] == "non_finite"}
+    without = {record["step"] for record in records if record["kind"] == "train" and record["total"] is None}
+    assert skipped == without and 0 < len(skipped) < STEPS
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(_final(tmp_path / "run")))
+
+
+def test_ten_skipped_batches_in_a_row_are_an_error(tmp_path):
+    with pytest.raises(loop.NonFiniteLossError, match="step 10: the loss is not finite"):
+        _train_on(Holed(), set(range(14)), tmp_path / "run", steps=12)
+
+
+def test_a_second_training_is_kept_out_of_a_run_folder(tmp_path, uninterrupted):
+    with run_folder.claimed(uninterrupted[0]), pytest.raises(BlockingIOError, match="another process is training here"):
+        _train(uninterrupted[0], resume=True)
+
+
 def test_bad_data_leaves_no_run_folder_behind(tmp_path):
     def missing():
         raise schema.DataError("data folder x does not exist")

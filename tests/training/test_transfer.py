@@ -20,7 +20,8 @@ from muvo_jax.training import transfer, validation
 def town():
     """A model of the town, small, of fresh weights; its images have the shape that those of the recording get."""
     config = config_lib.override_all(presets.get("tiny"), {
-        "model.image_size": (32, 96), "model.latent": "2d", "model.first_guess": "training_mean", "model.action_path": "recurrence"})
+        "model.image_size": (32, 96), "model.latent": "2d", "model.first_guess": "training_mean",
+        "model.action_path": "recurrence"})
     shapes = world_model.WorldModel(config.model).variable_shapes()
     generator = np.random.default_rng(0)
     return Run(None, jax.tree.map(lambda leaf: generator.normal(size=leaf.shape).astype(np.float32), shapes), config, 5)

@@ -201,12 +201,12 @@ def learn_to_drive(options):
 def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--run")
-    parser.add_argument("--steps", type=int, help="50,000 without a run, else 1,200,000")
+    parser.add_argument("--steps", type=int, help="50,000 without a run, else 600,000")
     parser.add_argument("--horizon", type=int, default=15, help="without a run")
-    parser.add_argument("--rounds", type=int, default=6, help="of imagining and learning, with a run")
+    parser.add_argument("--rounds", type=int, default=4, help="of imagining and learning, with a run")
     parser.add_argument("--drives", type=int, default=16, help="that judge it, with a run")
     options = parser.parse_args()
-    options.steps = options.steps or (1_200_000 if options.run else 50_000)
+    options.steps = options.steps or (600_000 if options.run else 50_000)
     if options.run:
         return learn_to_drive(options)
     config = PPOConfig()

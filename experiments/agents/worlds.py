@@ -41,7 +41,7 @@ class Dreams:
     Policies are jax.tree_util.Partial (key, observation "road") -> action.
     """
 
-    def __init__(self, run: str, starts: int = 256):
+    def __init__(self, run: str, starts: int = 128):
         self.run = checkpoint.load_run(run, "latest")
         self.world = environment.Environment.of_run(self.run, observation="road", reward_config=rewards.RewardConfig(
             speed_limit_mps=SPEED_LIMIT_MPS))
@@ -49,8 +49,8 @@ class Dreams:
         self.core = futures.SharedFutures(self.world)
 
     def futures(self, key, policy) -> futures.Futures:
-        """One from each recorded moment, 64 at a time."""
-        starts = jnp.arange(self.recorded.bank.size).reshape(-1, 64)
+        """One from each recorded moment, 16 at a time: each takes some ten MB of evidence."""
+        starts = jnp.arange(self.recorded.bank.size).reshape(-1, 16)
         parts = [futures.imagine(self.world, self.recorded, jax.random.fold_in(key, index), part, policy,
                                  train_agent.HORIZON) for index, part in enumerate(starts)]
         return jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *parts)

@@ -67,7 +67,6 @@ class StoaDoor:
 
     def start(self, key):
         state, timestep = self.env.reset(key)
-        assert timestep.first()
         return timestep.observation, state
 
     def step(self, carry, action):
@@ -243,6 +242,7 @@ def test_stoa_wrappers_reset_and_keep_the_final_observation():
     from stoa.core_wrappers import auto_reset
     env = auto_reset.AutoResetWrapper(door.env, next_obs_in_extras=True)
     state, timestep = env.reset(jax.random.key(0))
+    assert timestep.first()
     step = jax.jit(env.step)
     for _ in range(HORIZON):
         state, timestep = step(state, ACTION)

@@ -3,6 +3,7 @@
 import base64
 import io
 import json
+import re
 import shutil
 import subprocess
 
@@ -69,8 +70,22 @@ def test_nothing_is_fetched_and_no_title_ends_the_script(written):
 
 
 @pytest.mark.skipif(shutil.which("chromium") is None, reason="chromium is not installed")
-def test_a_browser_shows_the_last_observed_frame_s_successor(written):
-    shown = subprocess.run(["chromium", "--headless", "--no-sandbox", "--disable-gpu", "--dump-dom", written.as_uri()],
-                           capture_output=True, text=True, timeout=120, check=True).stdout
+def test_a_browser_shows_the_first_imagined_frame_and_follows_the_keys(written):
+    shown = browsed(written)
     assert "a &lt;/script&gt; title" in shown and ">imagined</span>" in shown and "+0.2 s" in shown
     assert shown.count('<img class="sensor"') == 6  # image and range of three columns
+    found, pressed = contents(written)[1], written.with_name("pressed.html")
+    keys = "".join(f"document.onkeydown(new KeyboardEvent('keydown', {{key: '{key}'}}));"
+                   for key in ("ArrowLeft", "ArrowDown", "ArrowDown"))
+    pressed.write_text(written.read_text(encoding="utf-8").replace("</body>", f"<script>{keys}</script></body>"),
+                       encoding="utf-8")
+    shown = browsed(pressed)
+    assert ">observed</span>" in shown and "+0.0 s" in shown and "future 2" in shown
+    pictures = re.findall('<img class="sensor"[^>]* src="([^"]*)"', shown)
+    assert pictures[1] == found["drawn"][1][1][1][0]  # the second column's image: future 2, the last observed frame
+
+
+def browsed(path):
+    """The page as it stands in a browser, after its scripts."""
+    return subprocess.run(["chromium", "--headless", "--no-sandbox", "--disable-gpu", "--dump-dom", path.as_uri()],
+                          capture_output=True, text=True, timeout=120, check=True).stdout

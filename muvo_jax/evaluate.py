@@ -108,7 +108,7 @@ def evaluate(options: Options, show: screen.Screen) -> dict[str, Any]:
             count = min(count or TRAINING_WINDOWS, TRAINING_WINDOWS)
         scores = protocol.evaluate(world_model.WorldModel(config.model), loaded.variables,
                                    validation.windows(frames, split, count), config, mean,
-                                   look=log and functools.partial(log_windows, log, config, split))
+                                   look=functools.partial(log_windows, log, config, split) if log else None)
         scores = _named(scores, card, frames, split, count)
         if options.uncertainty:
             scores["uncertainty"] = forecasts.measure(

@@ -59,7 +59,7 @@ def test_every_picture_lies_where_the_sliders_look_for_it(written):
         for frame in range(FRAMES):
             drawn = found["drawn"][1][branch][frame]
             assert mean_brightness(drawn[0]) == pytest.approx(40 * (frame + 1) + branch + 1, abs=2)
-    voxels = next(index for index, picture in enumerate(found["pictures"]) if picture["name"] == "voxels")
+    voxels = next(index for index, picture in enumerate(found["pictures"]) if picture["name"] == "voxels above")
     assert found["drawn"][2][0][0][voxels] is None and found["drawn"][0][0][0][voxels]
 
 

@@ -10,6 +10,7 @@ from muvo_jax.geometry import RouteMap
 from muvo_jax.limits import COUNT, NOT_NEGATIVE, SHARE, Limits, above, at_least, between, check
 
 MOMENTUM = Limits(0, 1, open_high=True)
+SIDE = between(-1000, 1000, "m")  # of a box around the lidar
 SEED = between(0, 2**32 - 1)
 
 
@@ -149,8 +150,8 @@ class EvaluationConfig:
     seed: Annotated[int, SEED] = 0
     batch_norm: Literal["running", "batch"] = "running"
     pixel_chamfer: Annotated[int, NOT_NEGATIVE] = 0
-    scan_region_m: tuple[float, ...] = ()
-    scan_without_m: tuple[float, ...] = ()
+    scan_region_m: Annotated[tuple[float, ...], SIDE] = ()
+    scan_without_m: Annotated[tuple[float, ...], SIDE] = ()
 
     def __post_init__(self):
         check(self)

@@ -81,8 +81,15 @@ class Validator:
 
 def windows(frames: pipeline.Frames, split: str, count: int,
             share: protocol.Share = protocol.Share()) -> Iterator[protocol.Windows]:
-    """At most `count` windows of a split (0: all) as `protocol.evaluate` takes them; of these a process's share."""
-    wants_scans = bool(frames.config.evaluation.scan_region_m)
+    """At most `count` windows of a split (0: all) as `protocol.evaluate` takes them; of these a process's share.
+
+    Raises:
+      DataError: where scores of scans are asked for and the recording lacks what they read.
+    """
+    wants_scans, description = bool(frames.config.evaluation.scan_region_m), frames.recording.description
+    if wants_scans and (lacking := {"points_m", "pose", "speed_mps"} - description.modalities):
+        raise schema.DataError(f"evaluation.scan_region_m asks for scores along the rays of scans, but recording "
+                               f"{description.name!r} has no {', '.join(sorted(lacking))}. Judge without them.")
     for entry in pipeline.evaluation_batches(frames, split, windows=count, process=share.process,
                                              processes=share.processes):
         drives = tuple(window.sequence.name for window in entry.windows)

@@ -1,6 +1,7 @@
 """Protocol cards: what may be called by a card's name, and what is refused."""
 
 import dataclasses
+import types
 
 import numpy as np
 import pytest
@@ -8,7 +9,9 @@ import pytest
 from muvo_jax import config as config_lib
 from muvo_jax import head as head_lib
 from muvo_jax import presets
+from muvo_jax.data import schema
 from muvo_jax.metrics import cards, protocol
+from muvo_jax.training import validation
 
 
 @pytest.fixture(scope="module")
@@ -112,3 +115,11 @@ def test_batch_statistics_are_those_of_training_without_dropout(monkeypatch):
     assert seen == {"train": True, "sampled": True, "dropout": 0.0, "keys": (2,)}
     with pytest.raises(ZeroDivisionError):
         predict("running")
+
+
+def test_scores_of_scans_need_scans_and_poses():
+    config = config_lib.override(presets.town(), "evaluation.scan_region_m", [-1, -1, -1, 1, 1, 1])
+    recording = types.SimpleNamespace(
+        description=types.SimpleNamespace(name="blind", modalities={"image", "speed_mps"}))
+    with pytest.raises(schema.DataError, match=r"along the rays of scans, but recording 'blind' has no points_m, pose"):
+        next(validation.windows(types.SimpleNamespace(config=config, recording=recording), "val", 1))

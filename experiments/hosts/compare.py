@@ -35,7 +35,10 @@ CLOCK = ("steps_per_s", "waiting_percent")
 
 
 def train(out: pathlib.Path, hosts: int, options: argparse.Namespace) -> list[dict]:
-    """What a training over that many processes logs."""
+    """What a training over that many processes logs; one that --out holds already is not repeated."""
+    folder = out / f"hosts-{hosts}"
+    if (folder / "checkpoints" / str(options.steps)).exists():
+        return logged(folder)
     with socket.socket() as free:
         free.bind(("localhost", 0))
         port = free.getsockname()[1]
@@ -52,7 +55,11 @@ def train(out: pathlib.Path, hosts: int, options: argparse.Namespace) -> list[di
     codes = [process.wait() for process in running]
     if any(codes):
         raise SystemExit(f"{hosts} hosts ended with {codes}: {out}/hosts-{hosts}-*.log")
-    return [record for record in run_folder.read_metrics(out / f"hosts-{hosts}") if record["kind"] != "time"]
+    return logged(folder)
+
+
+def logged(folder: pathlib.Path) -> list[dict]:
+    return [record for record in run_folder.read_metrics(folder) if record["kind"] != "time"]
 
 
 def furthest(ours: list[dict], theirs: list[dict]) -> tuple[float, str]:

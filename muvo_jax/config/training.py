@@ -91,6 +91,9 @@ class TrainConfig:
       restart: the observed frames of a training window are cut in two at a frame drawn anew in each step, so that the
         filter is trained on 1 to observe_frames of them.
       parallel: "auto" uses shard_map over all devices where there is more than one.
+      remat: what is computed again for the gradients instead of kept. "heads": what heads decode, one frame after the
+        other, so that one frame of one head is in memory at a time. "frames": the steps of the filter too, whose
+        attention over tokens fills the memory with the 2D latent of the paper's size. "none" takes least time.
       trainable: paths of the parameters that train, as patterns separated by commas: "decoders_*" trains the decoders
         alone, "!camera" all but the camera's encoder, "*" everything (see training/trainable.py).
       backbone_weights: file of an image network that fresh encoders start from; "" for none.
@@ -108,7 +111,7 @@ class TrainConfig:
     keep_last: Annotated[int, NOT_NEGATIVE] = 2
     keep_best: Annotated[int, NOT_NEGATIVE] = 1
     parallel: Literal["auto", "pmap", "shard_map"] = "auto"
-    remat: bool = False
+    remat: Literal["none", "heads", "frames"] = "none"
     decode_frames: Annotated[int, NOT_NEGATIVE] = 0
     observe_frames: Annotated[int, NOT_NEGATIVE] = 0
     restart: bool = False

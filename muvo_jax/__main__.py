@@ -10,8 +10,8 @@ import sys
 
 from muvo_jax import command_line
 
-COMMANDS = ("train", "evaluate", "dream", "train_agent", "drive", "doctor", "voxelize", "pack", "record_carla",
-            "export_muvo", "convert", "export", "interop.export_torch", "interop.parity")
+COMMANDS = ("train", "estimate", "evaluate", "dream", "train_agent", "drive", "doctor", "voxelize", "pack",
+            "record_carla", "export_muvo", "convert", "export", "interop.export_torch", "interop.parity")
 
 
 def describe(command: str) -> tuple[str, str]:

@@ -48,7 +48,7 @@ class Learned:
       predictions: scale -> [B, T, ...], at every scale of the head.
       batch: has the fields of the head's targets, and of those of its `term_targets` whose term is on.
       model, loss: units and settings.
-      keys: typed keys [B], one per sample, for terms that draw.
+      keys: typed keys [B, T], one per frame, for terms that draw.
       frozen: the network of the perceptual term, None where it is off.
     """
 

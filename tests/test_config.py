@@ -11,6 +11,7 @@ from muvo_jax import config as config_lib
 from muvo_jax import limits, presets
 from muvo_jax.config import migration, parts, sizes
 
+SHIPPED = pathlib.Path(presets.__file__).parent / "builtin/town/config.json"  # of version 2
 KEPT = pathlib.Path(__file__).parent / "kept_runs"  # config.json of version 1
 
 
@@ -121,10 +122,17 @@ def test_version_1_from_before_it_had_all_of_its_fields_and_what_never_was():
         config_lib.Config.from_dict({"model": {"fusion": "concat"}})
     with pytest.raises(ValueError, match=r"\(ModelConfig\): 'colour' is unknown"):
         config_lib.Config.from_dict({"model": {"colour": 3}})
-    with pytest.raises(ValueError, match="config_version is 3, and this version of muvo_jax reads 1 to 2"):
-        config_lib.Config.from_dict(tiny.to_dict() | {"config_version": 3})
+    with pytest.raises(ValueError, match="config_version is 4, and this version of muvo_jax reads 1 to 3"):
+        config_lib.Config.from_dict(tiny.to_dict() | {"config_version": 4})
     with pytest.raises(ValueError, match=r'config.model.latent: got \{\}, expected \{"kind": \.\.\.\} of 1d, 2d'):
         config_lib.Config.from_dict({"config_version": 2, "model": {"latent": {}}})
+
+
+@pytest.mark.parametrize(("before", "today"), [(False, "none"), (True, "frames")])
+def test_runs_of_version_2_keep_what_they_compute_again(before, today):
+    stored = json.loads(SHIPPED.read_text())
+    assert stored[migration.VERSION_FIELD] == 2
+    assert config_lib.Config.from_dict(stored | {"train": stored["train"] | {"remat": before}}).train.remat == today
 
 
 def test_every_moved_setting_has_a_place_today():

@@ -8,13 +8,11 @@ of the preset's sizes, fresh weights.
 import argparse
 import dataclasses
 import json
-import math
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import timing
-from jax.extend import core
 
 import muvo_jax
 from muvo_jax import config as config_lib
@@ -22,36 +20,10 @@ from muvo_jax import head as head_lib
 from muvo_jax import presets
 from muvo_jax.model import glimpse, rollout, world_model
 from muvo_jax.model import memory as memory_lib
-from muvo_jax.objectives import kl
+from muvo_jax.objectives import kl, total
 from muvo_jax.ops import camera, range_view
-from muvo_jax.training import optimizer, state, step
+from muvo_jax.training import cost, optimizer, state, step
 from muvo_jax.types import Batch
-
-GEMM = 2048
-
-
-def operations(function, *arguments) -> float:
-    """Of all products and convolutions in a function, loops counted as often as they run."""
-    return _operations(jax.make_jaxpr(function)(*arguments).jaxpr)
-
-
-def _operations(jaxpr) -> float:
-    total = 0.0
-    for equation in jaxpr.eqns:
-        if equation.primitive.name == "dot_general":
-            (contracted, _), _ = equation.params["dimension_numbers"]
-            sides = equation.invars[0].aval.shape
-            total += 2.0 * math.prod(equation.outvars[0].aval.shape) * math.prod(sides[axis] for axis in contracted)
-        elif equation.primitive.name == "conv_general_dilated":
-            kernel = equation.invars[1].aval.shape
-            outputs = kernel[equation.params["dimension_numbers"].rhs_spec[0]]
-            total += 2.0 * math.prod(equation.outvars[0].aval.shape) * math.prod(kernel) / outputs
-        elif equation.primitive.name == "cond":  # branches for platforms
-            total += max(_operations(branch.jaxpr) for branch in equation.params["branches"])
-        else:
-            times = equation.params.get("length", 1) if equation.primitive.name == "scan" else 1
-            total += times * sum(_operations(inner) for inner in core.jaxprs_in_params(equation.params))
-    return total
 
 
 def random_batch(config: config_lib.Config) -> Batch:
@@ -108,6 +80,7 @@ def parts(config: config_lib.Config, batch: Batch) -> dict[str, tuple]:
     states = jax.jit(lambda: step._and_imagined(model, variables, observed, batch.action, keys))()
     states, target = step._some_frames(states, batch, keys, config.train.decode_frames)
     flat = lambda tree: jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), tree)
+    frame_keys = total.frame_keys(keys, target.frames)
     places = jnp.repeat(jnp.arange(batch.batch_size), target.frames)
     for head in config.model.heads:
         own = of(f"decoders_{head}")
@@ -122,7 +95,7 @@ def parts(config: config_lib.Config, batch: Batch) -> dict[str, tuple]:
         predictions = jax.jit(decode)(own, states.deterministic).scales(head)
         rows[f"{head}: losses"] = (
             lambda predictions, head=head: [value.terms(name) for name, value in head_lib.get(head).losses(
-                head_lib.Learned(predictions, target, config.model, config.loss, keys, None)).items()],
+                head_lib.Learned(predictions, target, config.model, config.loss, frame_keys, None)).items()],
             (predictions,), ())
     rows["KL divergence"] = (lambda posterior, prior: kl.balanced_kl_sums(
         posterior, prior, balance=config.loss.kl_balance, numerics=config.model.numerics).terms("kl"),
@@ -140,6 +113,44 @@ def both_ways(function):
     return run
 
 
+def profile(config: config_lib.Config, rounds: int, rate: float) -> None:
+    """Prints a row for each part of the step and one for the whole; `rate` is that of a product (cost.product_rate)."""
+    batch = random_batch(config)
+    print("| part | forward (s) | with gradients (s) | arithmetic (GFLOP) | share of the product's speed |")
+    print("|---|---:|---:|---:|---:|")
+    for name, (function, arguments, _) in parts(config, batch).items():
+        forward, whole = jax.jit(function), jax.jit(both_ways(function))
+        taken = timing.processor_seconds({"forward": lambda run=forward, given=arguments: run(*given),
+                                          "whole": lambda run=whole, given=arguments: run(*given)}, rounds)
+        arithmetic = cost.operations(jax.make_jaxpr(both_ways(function))(*arguments).jaxpr)
+        row(name, min(taken["forward"]), min(taken["whole"]), arithmetic, rate)
+    update, train, arguments = updates(config, batch)
+    arithmetic = cost.operations(jax.make_jaxpr(train.compiled)(*arguments).jaxpr)
+    row("**whole step**", float("nan"), min(timing.processor_seconds({"whole": update}, rounds)["whole"]), arithmetic,
+        rate)
+
+
+def updates(config: config_lib.Config, batch: Batch):
+    """A function that makes one update after the other, the step, and its first arguments as shapes."""
+    model = muvo_jax.WorldModel(config.model)
+    held = [state.create(model.init(jax.random.key(0)), optimizer.make_optimizer(
+        config.optimizer, config.train.steps), jax.random.key(1))]
+    train = step.make_train_step(model, config)
+    placed = train.place(batch)
+    shapes = jax.eval_shape(lambda *arguments: arguments, held[0], placed)
+
+    def update():
+        held[0], metrics = train(held[0], placed)
+        return metrics
+
+    return update, train, shapes
+
+
+def row(name: str, forward_s: float, whole_s: float, arithmetic: float, rate: float) -> None:
+    print(f"| {name} | {forward_s:.3f} | {whole_s:.3f} | {arithmetic / 1e9:.1f} | {arithmetic / whole_s / rate:.0%} |",
+          flush=True)
+
+
 def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--preset", default="town")
@@ -149,36 +160,9 @@ def main():
     chosen = dict(setting.split("=", 1) for setting in options.set)
     config = config_lib.override_all(presets.get(options.preset), {
         name: json.loads(value) if value[:1] in "0123456789tf[" else value for name, value in chosen.items()})
-    batch = random_batch(config)
-    matrix = jax.random.normal(jax.random.key(0), (GEMM, GEMM))
-    product = jax.jit(lambda matrix: matrix @ matrix)
-    gemm_s = min(timing.processor_seconds({"product": lambda: product(matrix)}, 10)["product"])
-    peak = 2.0 * GEMM**3 / gemm_s
-    print(f"float32 product of {GEMM}x{GEMM}: {peak / 1e9:.0f} GFLOP a processor second\n")
-    print("| part | forward (s) | with gradients (s) | arithmetic (GFLOP) | share of the product's speed |")
-    print("|---|---:|---:|---:|---:|")
-    for name, (function, arguments, _) in parts(config, batch).items():
-        forward, whole = jax.jit(function), jax.jit(both_ways(function))
-        taken = timing.processor_seconds({"forward": lambda run=forward, given=arguments: run(*given),
-                                          "whole": lambda run=whole, given=arguments: run(*given)}, options.rounds)
-        row(name, min(taken["forward"]), min(taken["whole"]), operations(both_ways(function), *arguments), peak)
-    model = muvo_jax.WorldModel(config.model)
-    fresh = lambda: state.create(model.init(jax.random.key(0)), optimizer.make_optimizer(
-        config.optimizer, config.train.steps), jax.random.key(1))
-    train, held = step.make_train_step(model, config), [fresh()]
-    placed = train.place(batch)
-
-    def update():
-        held[0], metrics = train(held[0], placed)
-        return metrics
-
-    taken = timing.processor_seconds({"whole": update}, options.rounds)
-    row("**whole step**", float("nan"), min(taken["whole"]), float("nan"), peak)
-
-
-def row(name: str, forward_s: float, whole_s: float, arithmetic: float, peak: float) -> None:
-    print(f"| {name} | {forward_s:.3f} | {whole_s:.3f} | {arithmetic / 1e9:.1f} | {arithmetic / whole_s / peak:.0%} |",
-          flush=True)
+    rate = cost.product_rate()
+    print(f"float32 product of {cost.GEMM_SIDE}x{cost.GEMM_SIDE}: {rate / 1e9:.0f} GFLOP a processor second\n")
+    profile(config, options.rounds, rate)
 
 
 if __name__ == "__main__":

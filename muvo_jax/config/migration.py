@@ -2,6 +2,7 @@
 
     version 1    no config_version; model is one flat list of fields, its parts are named by text
     version 2    model.latent, fusion, lidar, camera and first_guess are parts: {"kind": "2d", ...} or null
+    version 3    train.remat is a policy, "none", "heads" or "frames"; it was false or true
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ from typing import Any
 from muvo_jax.config import parts
 from muvo_jax.config.parsing import check_choice
 
-VERSION = 2
+VERSION = 3
 VERSION_FIELD = "config_version"
 
 # Field of version 1's model -> part and field of version 2. Where the part is of a kind without such a field, it did
@@ -56,12 +57,12 @@ def to_current(values: Any) -> Any:
         return values  # parse says what is wrong
     version = values.get(VERSION_FIELD, 1)
     values = {name: value for name, value in values.items() if name != VERSION_FIELD}
-    if version == VERSION:
-        return values
-    if version != 1:
+    if version not in (1, 2, VERSION):
         raise ValueError(f"config: {VERSION_FIELD} is {version!r}, and this version of muvo_jax reads 1 to {VERSION}. "
                          f"Use the muvo_jax that wrote it.")
-    return _from_1(values)
+    if version == 1:
+        values = _from_1(values)
+    return values if version == VERSION else _from_2(values)
 
 
 def new_name(dotted: str) -> str | None:
@@ -79,6 +80,13 @@ def _from_1(values: dict[str, Any]) -> dict[str, Any]:
     if isinstance(values.get("model"), dict):
         changes["model"] = _model_from_1(values["model"])
     return values | changes
+
+
+def _from_2(values: dict[str, Any]) -> dict[str, Any]:
+    train = values.get("train")
+    if not isinstance(train, dict) or not isinstance(train.get("remat"), bool):
+        return values
+    return values | {"train": train | {"remat": "frames" if train["remat"] else "none"}}
 
 
 def _model_from_1(model: dict[str, Any]) -> dict[str, Any]:

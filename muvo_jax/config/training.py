@@ -95,6 +95,9 @@ class TrainConfig:
       parallel: "auto" uses shard_map over all devices where there is more than one.
       non_finite: what a batch does whose loss or gradient is not finite; none changes a parameter. "stop" ends the run
         with an error, "skip" goes on and counts it in metrics.jsonl (ten in a row are an error too).
+      remat: what is computed again for the gradients instead of kept. "heads": what heads decode, one frame after the
+        other, so that one frame of one head is in memory at a time. "frames": the steps of the filter too, whose
+        attention over tokens fills the memory with the 2D latent of the paper's size. "none" takes least time.
       trainable: paths of the parameters that train, as patterns separated by commas: "decoders_*" trains the decoders
         alone, "!camera" all but the camera's encoder, "*" everything (see training/trainable.py).
       backbone_weights: file of an image network that fresh encoders start from; "" for none.
@@ -113,7 +116,7 @@ class TrainConfig:
     keep_best: Annotated[int, NOT_NEGATIVE] = 1
     parallel: Literal["auto", "pmap", "shard_map"] = "auto"
     non_finite: Literal["stop", "skip"] = "stop"
-    remat: bool = False
+    remat: Literal["none", "heads", "frames"] = "none"
     decode_frames: Annotated[int, NOT_NEGATIVE] = 0
     observe_frames: Annotated[int, NOT_NEGATIVE] = 0
     restart: bool = False

@@ -70,10 +70,12 @@ def mean_mode(noise: StepNoise) -> StepNoise:
 
 
 def filter_embeddings(model: WorldModel, variables: Variables, embedding: jax.Array, action: ArrayLike,
-                      is_first: ArrayLike, noise: StepNoise, speed_mps: ArrayLike | None = None) -> Observed:
+                      is_first: ArrayLike, noise: StepNoise, speed_mps: ArrayLike | None = None, *,
+                      remat: bool = False) -> Observed:
     """Scans observe_step from the zero state over [B, T, ...]; action[t - 1] drives step t, zeros the first one.
 
     speed_mps: [B, T], for a model that tracks its motion. Vantages and memory are left to memory.of_window.
+    remat: whether the gradients compute each step again instead of keeping all of it.
     """
     previous = jnp.concatenate([jnp.zeros_like(action[:, :1]), action[:, :-1]], axis=1)
 
@@ -87,13 +89,15 @@ def filter_embeddings(model: WorldModel, variables: Variables, embedding: jax.Ar
         return state, (deterministic, prior, posterior)
 
     inputs = jax.tree.map(_swap_time, (noise, previous, embedding, is_first, speed_mps))
-    _, outputs = jax.lax.scan(step, model.initial_state(embedding.shape[0]), inputs)
+    scanned = jax.checkpoint(step, prevent_cse=False) if remat else step
+    _, outputs = jax.lax.scan(scanned, model.initial_state(embedding.shape[0]), inputs)
     deterministic, prior, posterior = jax.tree.map(_swap_time, outputs)
     return Observed(LatentState(deterministic, posterior.sample(noise.posterior)), posterior, prior)
 
 
 def observe_window(model: WorldModel, variables: Variables, batch: Batch, keys: jax.Array, *, train: bool,
-                   axis_name: str | None = None, sampled: bool = True) -> tuple[Observed, Variables]:
+                   axis_name: str | None = None, sampled: bool = True,
+                   remat: bool = False) -> tuple[Observed, Variables]:
     """Encodes and filters a window; what the training step differentiates.
 
     Args:
@@ -103,6 +107,7 @@ def observe_window(model: WorldModel, variables: Variables, batch: Batch, keys: 
       train: batch statistics, dropout and the RSSM dropout are on.
       axis_name: mapped axis over which the batch is split, for BatchNorm.
       sampled: sample the latents; otherwise take their means.
+      remat: whether the gradients compute the steps of the filter again.
 
     Returns:
       Observed [B, T, ...] and the (updated) batch_stats.
@@ -115,7 +120,7 @@ def observe_window(model: WorldModel, variables: Variables, batch: Batch, keys: 
         noise = mean_mode(noise)
     moved = memory_lib.measured(model.config, batch) if model.config.tracks_motion else None
     observed = filter_embeddings(model, variables, embedding, batch.action, batch.is_first, noise,
-                                 None if moved is None else moved.speed_mps)
+                                 None if moved is None else moved.speed_mps, remat=remat)
     if model.config.tracks_motion:
         moved = moved or memory_lib.from_arrivals(model.ego_motion(variables, observed.states))
         states, remembered = memory_lib.of_window(model.config, batch, observed.states, moved)

@@ -13,8 +13,6 @@ from muvo_jax import types
 from muvo_jax.objectives import regression
 from muvo_jax.ops import nearest
 
-_KEY_SITE = 0xC4A3  # separates this draw from all others made with the same sample key
-
 
 def chamfer_sums(prediction: types.Array, target: types.Array, keys: types.Array, *, points: int,
                  return_threshold_m: float, scale_m: float) -> regression.MeanSums:
@@ -22,14 +20,11 @@ def chamfer_sums(prediction: types.Array, target: types.Array, keys: types.Array
 
     Args:
       prediction, target: float32 [B, T, Hr, Wr, 4], metres.
-      keys: typed keys [B], one per sample.
+      keys: typed keys [B, T], one per frame.
       points: size of the subset of each side.
       return_threshold_m: a predicted return is a predicted range above this.
       scale_m: metres per unit of the loss.
     """
-    frames = prediction.shape[1]
-    frame_keys = jax.vmap(lambda key: jax.random.split(jax.random.fold_in(key, _KEY_SITE), frames))(keys)
-
     def frame_sums(predicted, measured, key):
         predicted, measured = predicted.reshape(-1, 4), measured.reshape(-1, 4)
         key_predicted, key_measured = jax.random.split(key)
@@ -37,7 +32,7 @@ def chamfer_sums(prediction: types.Array, target: types.Array, keys: types.Array
         others, others_mask = _subset(measured, measured[:, 3] > 0.0, key_measured, points)
         return frame_chamfer(some / scale_m, some_mask, others / scale_m, others_mask)
 
-    distance, defined = jax.vmap(jax.vmap(frame_sums))(prediction.astype(jnp.float32), target, frame_keys)
+    distance, defined = jax.vmap(jax.vmap(frame_sums))(prediction.astype(jnp.float32), target, keys)
     return regression.MeanSums(distance.sum(), defined.sum().astype(jnp.float32))
 
 

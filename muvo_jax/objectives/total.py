@@ -16,6 +16,8 @@ from muvo_jax import head as head_lib
 from muvo_jax import types
 from muvo_jax.objectives import kl, perceptual
 
+_KEY_SITE = 0xC4A3  # separates the draws of loss terms from all others made with the same sample key
+
 
 def term_weights(loss: config_lib.LossConfig, heads: tuple[str, ...]) -> dict[str, float]:
     """{term: weight} of every term these heads have; a weight of 0 leaves the term out."""
@@ -33,18 +35,40 @@ def loss_sums(predictions: types.Predictions, batch: types.Batch, observed: type
       batch: the targets.
       observed: posterior and prior of every frame.
       model, loss: weights and units.
-      keys: typed keys [B], one per sample (for the optional Chamfer term).
+      keys: typed keys [B], one per sample (for terms that draw, such as the optional Chamfer term).
       frozen: the network of the optional perceptual term.
 
     Raises:
       ValueError: where a head has no target or lacks a scale.
     """
-    sums: dict[str, head_lib.Sums] = {"kl": kl.balanced_kl_sums(observed.posterior, observed.prior,
-                                                             balance=loss.kl_balance, numerics=model.numerics)}
+    sums = kl_sums(observed, model=model, loss=loss)
     for head in model.heads:
-        check_head(head, predictions, batch, model, loss)
-        sums |= head_lib.get(head).losses(head_lib.Learned(predictions.scales(head), batch, model, loss, keys, frozen))
+        sums |= head_sums(head, predictions, batch, model=model, loss=loss, keys=frame_keys(keys, batch.frames),
+                          frozen=frozen)
     return sums
+
+
+def kl_sums(observed: types.Observed, *, model: config_lib.ModelConfig,
+            loss: config_lib.LossConfig) -> dict[str, head_lib.Sums]:
+    """The one term that no head has: {"kl": sums}."""
+    return {"kl": kl.balanced_kl_sums(observed.posterior, observed.prior, balance=loss.kl_balance,
+                                      numerics=model.numerics)}
+
+
+def head_sums(head: str, predictions: types.Predictions, batch: types.Batch, *, model: config_lib.ModelConfig,
+              loss: config_lib.LossConfig, keys: types.Array,
+              frozen: perceptual.FrozenEncoder | None = None) -> dict[str, head_lib.Sums]:
+    """The sums of one head. They add over frames too, so that frames may be decoded and scored one after the other.
+
+    Arguments as `loss_sums`, but for `keys`: [B, T], of `frame_keys`.
+    """
+    check_head(head, predictions, batch, model, loss)
+    return dict(head_lib.get(head).losses(head_lib.Learned(predictions.scales(head), batch, model, loss, keys, frozen)))
+
+
+def frame_keys(keys: types.Array, frames: int) -> types.Array:
+    """Typed keys [B, frames] for terms that draw, of those of the samples [B]."""
+    return jax.vmap(lambda key: jax.random.split(jax.random.fold_in(key, _KEY_SITE), frames))(keys)
 
 
 def combine(sums: Mapping[str, head_lib.Sums], weights: Mapping[str, float]) -> dict[str, types.Array]:

@@ -132,16 +132,39 @@ def place_batch(plan: Plan, batch: types.Batch, accumulate: int) -> types.Batch:
     Raises:
       ValueError: where the windows cannot be split evenly.
     """
-    windows, devices = batch.batch_size, len(plan.devices) // plan.processes
-    if windows % (accumulate * devices):
-        raise ValueError(f"a batch of {windows} windows cannot be split into {accumulate} micro-batches over {devices} "
-                         f"devices; expected a multiple of {accumulate * devices}.")
-    leading = (accumulate, devices, -1) if plan.mode == "pmap" else (accumulate, windows // accumulate)
+    leading, sharding = _split(plan, batch.batch_size, accumulate), _batch_sharding(plan)
     split = jax.tree.map(lambda leaf: leaf.reshape(*leading, *leaf.shape[1:]), batch)
     if plan.processes == 1:
         return jax.device_put(split, plan.batch_sharding)
     upload = functools.partial(jax.make_array_from_process_local_data, plan.batch_sharding)
     return jax.tree.map(lambda leaf: upload(np.asarray(leaf)), split)
+
+
+def placed_state_shapes(plan: Plan, state: Any) -> Any:
+    """What `place_state` returns of a state of these shapes, as jax.ShapeDtypeStruct leaves."""
+    sharding = NamedSharding(plan.mesh, PartitionSpec())
+    return jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=sharding), state)
+
+
+def placed_batch_shapes(plan: Plan, batch: types.Batch, accumulate: int) -> types.Batch:
+    """What `place_batch` returns of a batch of these shapes, as jax.ShapeDtypeStruct leaves; arguments as there."""
+    leading, sharding = _split(plan, batch.batch_size, accumulate), _batch_sharding(plan)
+    leading = (leading[0], leading[1] * plan.processes, *leading[2:])  # each process has its share of a micro-batch
+    return jax.tree.map(lambda leaf: jax.ShapeDtypeStruct((*leading, *leaf.shape[1:]), leaf.dtype, sharding=sharding),
+                        batch)
+
+
+def _split(plan: Plan, windows: int, accumulate: int) -> tuple[int, ...]:
+    devices = len(plan.devices) // plan.processes
+    if windows % (accumulate * devices):
+        raise ValueError(f"a batch of {windows} windows cannot be split into {accumulate} micro-batches over {devices} "
+                         f"devices; expected a multiple of {accumulate * devices}.")
+    each = windows // accumulate
+    return (accumulate, devices, each // devices) if plan.mode == "pmap" else (accumulate, each)
+
+
+def _batch_sharding(plan: Plan) -> NamedSharding:
+    return NamedSharding(plan.mesh, PartitionSpec(None, AXIS))
 
 
 def spread(plan: Plan, body: Body, *, donate_state: bool = False) -> Callable[[Any, types.Batch], Any]:

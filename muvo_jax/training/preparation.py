@@ -56,6 +56,20 @@ class Prepared:
         return parallel_lib.place_state(self.step.plan, state)
 
 
+@dataclasses.dataclass(frozen=True)
+class Planned:
+    """A step and the shapes that it will be compiled for, with their places on the devices; nothing is computed.
+
+    Attributes:
+      step: its function is still to be compiled.
+      state, batch: of jax.ShapeDtypeStruct.
+    """
+
+    step: step_lib.SpreadFunction
+    state: state_lib.TrainState
+    batch: types.Batch
+
+
 TOWN_RECORDS = frozenset({"reward", "is_terminal", "speed_mps"})
 
 
@@ -94,6 +108,18 @@ def check_trainable(config: config_lib.Config) -> None:
         trainable.chosen(params, config.train.trainable)
 
 
+def plan(config: config_lib.Config, batch_shapes: types.Batch,
+         frozen: perceptual.FrozenEncoder | None = None) -> Planned:
+    """What `prepare` compiles, without weights; arguments and errors as there."""
+    model = world_model.WorldModel(config.model)
+    step = step_lib.make_train_step(model, config, frozen=frozen)
+    optimizer = optimizer_lib.make_optimizer(config.optimizer, config.train.steps)
+    fresh = lambda variables: state_lib.create(variables, optimizer, jax.random.key(0), config.train.trainable)
+    state = jax.eval_shape(fresh, model.variable_shapes())
+    return Planned(step, parallel_lib.placed_state_shapes(step.plan, state),
+                   parallel_lib.placed_batch_shapes(step.plan, batch_shapes, config.optimizer.accumulate))
+
+
 def prepare(config: config_lib.Config, batch_shapes: types.Batch,
             frozen: perceptual.FrozenEncoder | None = None) -> Prepared:
     """Initialises the model and compiles its training step.
@@ -116,9 +142,9 @@ def prepare(config: config_lib.Config, batch_shapes: types.Batch,
     state = state_lib.create(variables, optimizer, jax.random.fold_in(run_key, 1), config.train.trainable)
     state = jax.block_until_ready(parallel_lib.place_state(step.plan, state))
     initialised_s = time.perf_counter()
-    placed = jax.tree.map(lambda leaf: np.zeros(leaf.shape, leaf.dtype), batch_shapes)
     jitted: Any = step.compiled
-    compiled = jitted.lower(state, step.place(placed)).compile()
+    placed = parallel_lib.placed_batch_shapes(step.plan, batch_shapes, config.optimizer.accumulate)
+    compiled = jitted.lower(state, placed).compile()
     return Prepared(model, state, dataclasses.replace(step, compiled=compiled), batch_shapes,
                     initialised_s - start_s, time.perf_counter() - initialised_s)
 

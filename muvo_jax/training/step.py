@@ -8,7 +8,6 @@ one window are not one batch of 16 windows.
 from __future__ import annotations
 
 import dataclasses
-import functools
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -18,10 +17,9 @@ import optax
 
 from muvo_jax import config as config_lib
 from muvo_jax import types
-from muvo_jax.metrics import image as image_metrics
 from muvo_jax.model import rollout, world_model
 from muvo_jax.objectives import perceptual, total
-from muvo_jax.training import augmentation, light, mirror, trainable
+from muvo_jax.training import augmentation, light, mirror, scoring, trainable
 from muvo_jax.training import optimizer as optimizer_lib
 from muvo_jax.training import parallel as parallel_lib
 from muvo_jax.training import state as state_lib
@@ -63,7 +61,8 @@ def make_train_step(model: world_model.WorldModel, config: config_lib.Config, *,
 
     The metrics are float32 scalars: every loss term (unweighted), "total", "psnr_db" of the observed images,
     "learning_rate", the norms "gradient_norm", "parameter_norm", "update_norm" of what trains, and "finite" (1 or 0).
-    An update that is not finite is not applied, so the parameters stay usable; the step is counted.
+    An update that is not finite is not applied, so the parameters stay usable (its "update_norm" is 0); the step is
+    counted.
 
     Args:
       model: what is trained.
@@ -84,17 +83,25 @@ def make_train_step(model: world_model.WorldModel, config: config_lib.Config, *,
     def body(state, batch, axis_name):
         gradients, batch_stats, metrics = gradients_of(state, batch, axis_name)
         trained, frozen_params = trainable.split(state.params, trainable.chosen(state.params, config.train.trainable))
-        updates, opt_state = optimizer.update(gradients, state.opt_state, trained)
         gradient_norm = optimizer_lib.norm(gradients)
         finite = jnp.isfinite(metrics["total"]) & jnp.isfinite(gradient_norm)
-        before = (trained, state.batch_stats, state.opt_state)
-        after = (optax.apply_updates(trained, updates), batch_stats, opt_state)
-        params, batch_stats, opt_state = jax.tree.map(lambda new, old: jnp.where(finite, new, old), after, before)
+
+        def updated():
+            updates, opt_state = optimizer.update(gradients, state.opt_state, trained)
+            norms = {"parameter_norm": optimizer_lib.norm(trained), "update_norm": optimizer_lib.norm(updates)}
+            return (optax.apply_updates(trained, updates), batch_stats, opt_state), norms
+
+        def kept():
+            return (trained, state.batch_stats, state.opt_state), {"parameter_norm": optimizer_lib.norm(trained),
+                                                                   "update_norm": jnp.float32(0.0)}
+
+        # A branch, because XLA does all in it after the gradients. Outside it copies the moments and packs the
+        # parameters as soon as it can, at the start of the step, and keeps the copies through all of it.
+        (params, batch_stats_after, opt_state), norms = jax.lax.cond(finite, updated, kept)
         metrics |= {"learning_rate": rate(state.step), "gradient_norm": gradient_norm,
-                    "parameter_norm": optimizer_lib.norm(trained), "update_norm": optimizer_lib.norm(updates),
-                    "finite": finite.astype(jnp.float32)}
+                    "finite": finite.astype(jnp.float32)} | norms
         return state.replace(step=state.step + 1, params=trainable.merge(params, frozen_params),
-                             batch_stats=batch_stats, opt_state=opt_state), metrics
+                             batch_stats=batch_stats_after, opt_state=opt_state), metrics
 
     plan = parallel_lib.make_plan(parallel or config.train.parallel, config.train.batch, devices)
     return SpreadFunction(plan, config.optimizer.accumulate, parallel_lib.spread(plan, body, donate_state=True))
@@ -200,32 +207,29 @@ def forward(params: Any, batch_stats: Any, batch: types.Batch, keys: types.Array
         batch = mirror.randomly(batch, keys)
     if train and config.augmentation.light:
         batch = light.randomly(batch, keys)
-    maybe_remat = jax.checkpoint if config.train.remat else lambda function: function
     variables = {"params": params, "batch_stats": batch_stats}
     seen = min(config.train.observe_frames or batch.frames, batch.frames) if train else batch.frames
-    observe = functools.partial(rollout.observe_window, model, train=train, axis_name=axis_name)
     shown = batch.time_slice(0, seen)
     if train:
         shown = augmentation.augment(shown, keys, config.augmentation)
         if config.train.restart:
             shown = dataclasses.replace(shown, is_first=_restarted(shown.is_first, keys))
-    observed, batch_stats = maybe_remat(observe)(variables, shown, keys)
+    observed, batch_stats = rollout.observe_window(model, variables, shown, keys, train=train, axis_name=axis_name,
+                                                   remat=config.train.remat == "frames")
     states, memory = observed.states, observed.memory
     if memory is not None and memory.image is not None:  # not augmented: the target is not either
         memory = dataclasses.replace(memory, image=jnp.asarray(batch.image)[:, :seen])
     if train:
         states = _and_imagined(model, variables, observed, batch.action, keys)
         states, batch = _some_frames(states, batch, keys, config.train.decode_frames)
-    predictions = types.Predictions({})
-    for head in model.config.heads:
-        decode = functools.partial(model.decode, heads=(head,))
-        predictions |= maybe_remat(decode)(variables, states, memory=memory)
-    terms = total.losses(predictions, batch, observed, model=model.config, loss=config.loss, keys=keys,
-                         axis_name=axis_name, frozen=frozen)
-    metrics = dict(terms)
-    if batch.image is not None and "image" in predictions:
-        metrics["psnr_db"] = _mean(image_metrics.frame_psnr_db(predictions.image, batch.image), axis_name)
-    return terms["total"], (metrics, batch_stats)
+    sums = total.kl_sums(observed, model=model.config, loss=config.loss) | scoring.sums(
+        model, variables, states, memory, batch, keys, config=config, frozen=frozen,
+        one_by_one=train and config.train.remat != "none")
+    if axis_name is not None:
+        sums = jax.lax.psum(sums, axis_name)
+    beside = sums.pop(scoring.PSNR).terms(scoring.PSNR) if scoring.PSNR in sums else {}
+    terms = total.combine(sums, total.term_weights(config.loss, model.config.heads))
+    return terms["total"], (terms | beside, batch_stats)
 
 
 def _and_imagined(model: world_model.WorldModel, variables: types.Variables, observed: types.Observed,
@@ -264,8 +268,3 @@ def _some_frames(states: types.LatentState, batch: types.Batch, keys: types.Arra
     chosen = jax.vmap(draw)(keys)
     pick = jax.vmap(lambda leaf, index: leaf[index])
     return jax.tree.map(lambda leaf: pick(leaf, chosen), states), batch.map_frames(lambda leaf: pick(leaf, chosen))
-
-
-def _mean(values: types.Array, axis_name: str | None) -> types.Array:
-    mean = values.mean()
-    return mean if axis_name is None else jax.lax.pmean(mean, axis_name)

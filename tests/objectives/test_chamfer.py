@@ -14,7 +14,7 @@ def frames(*pixels):
 
 
 def sums_of(prediction, target, points=8, seed=0):
-    return chamfer.chamfer_sums(prediction, target, jax.random.split(jax.random.key(seed), prediction.shape[0]),
+    return chamfer.chamfer_sums(prediction, target, jax.random.split(jax.random.key(seed), prediction.shape[:2]),
                                 points=points, return_threshold_m=1.0, scale_m=50.0)
 
 

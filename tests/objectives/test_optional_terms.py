@@ -110,7 +110,8 @@ def test_image_terms_with_road_users_once_more_are_the_references():
     model = dataclasses.replace(MODEL, heads=("image",))
     loss = dataclasses.replace(LOSS, image=0.1, image_instance=0.05)
     predicted = types.Predictions({"image": predictions})
-    every = lambda batch: total.losses(predicted, batch, observed, model=model, loss=loss, keys=None)
+    keys = jax.random.split(jax.random.key(0), 1)
+    every = lambda batch: total.losses(predicted, batch, observed, model=model, loss=loss, keys=keys)
     got, expected = jax.jit(every)(batch), 0.0
     for f in (1, 2, 4):
         rgb = (0.1 * got[f"image_{f}"] + 0.05 * got[f"image_instance_{f}"]) / f

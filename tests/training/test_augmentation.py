@@ -66,18 +66,18 @@ def test_the_loss_compares_with_the_recorded_image(monkeypatch, train):
     """Of a training step the encoder gets the changed batch, the loss the recorded one; elsewhere both get that."""
     batch, seen = small_world.make_batch(presets.tiny().model), {}
     zeros = np.zeros((*batch.action.shape[:2], 4), np.float32)
-    pair = types.Gaussian(zeros, zeros)
+    pair = types.Gaussian(zeros, zeros + 1)
 
     def observe_window(model, variables, batch, keys, **options):
         return seen.update(encoder=batch) or (types.Observed(types.LatentState(zeros, zeros), pair, pair), {})
 
-    def losses(predictions, batch, observed, **options):
-        return seen.update(loss=batch) or {"total": np.float32(0.0)}
+    def sums(model, variables, states, memory, batch, keys, **options):
+        return seen.update(loss=batch) or {}
 
     monkeypatch.setattr(step_lib.augmentation, "augment",
                         lambda batch, keys, settings: dataclasses.replace(batch, image=255 - batch.image))
     monkeypatch.setattr(step_lib.rollout, "observe_window", observe_window)
-    monkeypatch.setattr(step_lib.total, "losses", losses)
+    monkeypatch.setattr(step_lib.scoring, "sums", sums)
     model = python_types.SimpleNamespace(config=dataclasses.replace(presets.tiny().model, heads=()))
     step_lib.forward({}, {}, batch, None, model=model, config=presets.tiny(), train=train, axis_name=None)
     np.testing.assert_array_equal(seen["loss"].image, batch.image)

@@ -132,7 +132,7 @@ def place_batch(plan: Plan, batch: types.Batch, accumulate: int) -> types.Batch:
     Raises:
       ValueError: where the windows cannot be split evenly.
     """
-    leading, sharding = _split(plan, batch.batch_size, accumulate), _batch_sharding(plan)
+    leading = _split(plan, batch.batch_size, accumulate)
     split = jax.tree.map(lambda leaf: leaf.reshape(*leading, *leaf.shape[1:]), batch)
     if plan.processes == 1:
         return jax.device_put(split, plan.batch_sharding)
@@ -148,7 +148,7 @@ def placed_state_shapes(plan: Plan, state: Any) -> Any:
 
 def placed_batch_shapes(plan: Plan, batch: types.Batch, accumulate: int) -> types.Batch:
     """What `place_batch` returns of a batch of these shapes, as jax.ShapeDtypeStruct leaves; arguments as there."""
-    leading, sharding = _split(plan, batch.batch_size, accumulate), _batch_sharding(plan)
+    leading, sharding = _split(plan, batch.batch_size, accumulate), plan.batch_sharding
     leading = (leading[0], leading[1] * plan.processes, *leading[2:])  # each process has its share of a micro-batch
     return jax.tree.map(lambda leaf: jax.ShapeDtypeStruct((*leading, *leaf.shape[1:]), leaf.dtype, sharding=sharding),
                         batch)
@@ -161,10 +161,6 @@ def _split(plan: Plan, windows: int, accumulate: int) -> tuple[int, ...]:
                          f"devices; expected a multiple of {accumulate * devices}.")
     each = windows // accumulate
     return (accumulate, devices, each // devices) if plan.mode == "pmap" else (accumulate, each)
-
-
-def _batch_sharding(plan: Plan) -> NamedSharding:
-    return NamedSharding(plan.mesh, PartitionSpec(None, AXIS))
 
 
 def spread(plan: Plan, body: Body, *, donate_state: bool = False) -> Callable[[Any, types.Batch], Any]:

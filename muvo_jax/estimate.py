@@ -154,7 +154,7 @@ def _say_time(show: screen.Screen, step: cost.StepCost, rate: float, share: floa
 
 
 def main() -> int:
-    return command_line.run(Options, estimate, program="estimate", examples=_EXAMPLES, trains=True)
+    return command_line.run(Options, estimate, program="estimate", examples=_EXAMPLES)
 
 
 if __name__ == "__main__":

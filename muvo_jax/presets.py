@@ -98,7 +98,8 @@ def paper() -> config_lib.Config:
 def paper_occupancy() -> config_lib.Config:
     """The paper's model with occupancy: 6 frames, 4 observed and 2 imagined.
 
-    The built-in town is recorded in its smallest size only: at these sensor sizes a frame takes about a second.
+    The built-in town is recorded in its smallest size only: at these sensor sizes a frame takes about a second. Heads
+    decode frame by frame in training: the voxels of all six at once are most of a step's memory (docs/performance.md).
     """
     return config_lib.Config(
         preset="paper-occupancy",
@@ -106,11 +107,15 @@ def paper_occupancy() -> config_lib.Config:
         augmentation=_AUGMENTED,
         contract=_CONTRACT,
         data=config_lib.DataConfig(frames=6, context=4, horizon=2, town_size="tiny"),
+        train=config_lib.TrainConfig(remat="heads"),
     )
 
 
 def _reference(preset: str, loss: config_lib.LossConfig, **model) -> config_lib.Config:
-    """What the authors' released models share: their numerics, lengths and schedule, over 6 observed frames."""
+    """What the authors' released models share: their numerics, lengths and schedule, over 6 observed frames.
+
+    Heads decode frame by frame, as in `paper_occupancy`.
+    """
     return config_lib.Config(
         preset=preset,
         model=config_lib.ModelConfig(numerics="reference", **model),
@@ -119,7 +124,7 @@ def _reference(preset: str, loss: config_lib.LossConfig, **model) -> config_lib.
         augmentation=_AUGMENTED,
         contract=_CONTRACT,
         data=config_lib.DataConfig(frames=6, context=6, horizon=10, town_size="tiny"),
-        train=config_lib.TrainConfig(steps=100_000),
+        train=config_lib.TrainConfig(steps=100_000, remat="heads"),
     )
 
 

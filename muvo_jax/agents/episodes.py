@@ -89,10 +89,10 @@ def check(model: WorldModel, bank: StartBank) -> None:
     for name, (index, count) in indices.items():
         if isinstance(index, jax.core.Tracer):
             continue
-        index = np.asarray(index)  # concrete where the rest is traced, too
-        if jnp.shape(index) != lead or np.min(index) < 0 or np.max(index) >= count:
-            raise ValueError(f"StartBank: {name} {list(jnp.shape(index))} reaches from {np.min(index)} to "
-                             f"{np.max(index)}, but the memory holds {windows} windows of {frames} observations and "
+        places = np.asarray(index)  # concrete where the rest is traced, too
+        if places.shape != lead or places.min() < 0 or places.max() >= count:
+            raise ValueError(f"StartBank: {name} {list(places.shape)} reaches from {places.min()} to "
+                             f"{places.max()}, but the memory holds {windows} windows of {frames} observations and "
                              f"there are {bank.size} starts. States and memory must come from one call of observe.")
 
 

@@ -66,7 +66,8 @@ def of_step(config: config_lib.Config, batch_shapes: types.Batch,
     """
     start_s = time.perf_counter()
     planned = preparation.plan(config, batch_shapes, frozen)
-    traced = planned.step.compiled.trace(planned.state, planned.batch)
+    jitted: Any = planned.step.compiled
+    traced = jitted.trace(planned.state, planned.batch)
     memory = traced.lower().compile().memory_analysis()
     own = lambda tree: sum(leaf.dtype.itemsize * math.prod(leaf.sharding.shard_shape(leaf.shape))
                            for leaf in jax.tree.leaves(tree))

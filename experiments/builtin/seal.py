@@ -5,11 +5,13 @@ what ships. RUN is trained by the command in docs/models.md. What ships is judge
 which a test recomputes (tests/training/test_builtin.py).
 """
 
+import dataclasses
 import json
 import pathlib
 import sys
 
 import muvo_jax
+from muvo_jax import config as config_lib
 from muvo_jax.training import builtin, validation
 
 SCORES = ("psnr_db", "chamfer_m", "chamfer_above_m", "iou_occ_above_observed", "iou_occ_movers", "iou_occ_observed",
@@ -34,6 +36,8 @@ def add_sample(name: str) -> None:
 
 def main(run: str, name: str) -> None:
     loaded = muvo_jax.load(run)
+    # The held-out drives of both sizes are the same, and who looks at them need not record four times the others.
+    loaded = dataclasses.replace(loaded, config=config_lib.override(loaded.config, "data.town_size", "default"))
     report = json.loads((loaded.folder / "evaluation.json").read_text(encoding="utf-8"))
     pick = lambda score: {name: value for name, value in score.items() if name in ("mean", "interval", "per_step")}
     scores = {split: {source: {name: pick(values[name]) for name in SCORES if name in values}

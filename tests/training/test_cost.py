@@ -9,7 +9,7 @@ import pytest
 from muvo_jax import config as config_lib
 from muvo_jax import estimate, presets
 from muvo_jax.ops import conv
-from muvo_jax.training import cost
+from muvo_jax.training import cost, screen
 
 COST = cost.StepCost("one cpu device", 10, state_bytes=100, batch_bytes=10, working_bytes=50, operations=1e9,
                      compilation_s=1.0)
@@ -66,3 +66,20 @@ def test_what_fits_keeps_the_windows_of_an_update(monkeypatch, available, fixed,
     assert (fits and (fits.train.remat, fits.train.batch, fits.optimizer.accumulate)) == found
     if fits:
         assert dataclasses.replace(fits, train=config.train, optimizer=config.optimizer) == config
+
+
+def test_the_command_says_what_is_needed_what_fits_and_that_nothing_does(monkeypatch, capsys):
+    monkeypatch.setattr(estimate, "of_config", Costs())
+    monkeypatch.setattr(jax, "device_count", lambda: 1)
+    monkeypatch.setattr(estimate, "of_process", lambda config: 1000.0)
+    monkeypatch.setattr(cost, "product_rate", lambda dtype: 1e9)
+    options = estimate.Options(preset="paper-occupancy", memory_gib=1130 / 2**30, share=0.25)
+    estimate.estimate(options, screen.Screen())
+    shown = capsys.readouterr().out
+    assert "16 windows of 6 frames an update, 1 at a time (--batch=1 --accumulate=16), train.remat=heads" in shown
+    assert "4.00 processor seconds a step" in shown and "25% of the 1 GFLOP a second" in shown
+    assert "as it is" in shown
+    estimate.estimate(dataclasses.replace(options, memory_gib=1.0), screen.Screen())
+    assert "--batch=16 --accumulate=1 --set train.remat=none" in capsys.readouterr().out
+    with pytest.raises(ValueError, match="not even one window at a time fits"):
+        estimate.estimate(dataclasses.replace(options, memory_gib=0.0), screen.Screen())

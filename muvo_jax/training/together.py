@@ -27,7 +27,7 @@ from muvo_jax.training import screen
 
 WAIT_S = 45.0  # for a coordinator, before a host says that there is none
 WAIT_FOR_ALL_S = 300.0  # for hosts that start late, as where images are still pulled
-_HEARTBEAT_S = 30  # a host that is silent for so long is lost
+_HEARTBEAT_S = 45  # a host that is silent for so long is lost; a starved machine may well be for 30
 _DAY_S = 24 * 3600  # hosts wait so long at the end for the first one, which evaluates
 _AUTO = "auto"
 _LOSS = re.compile("Gloo|NCCL|RCCL|coordination service|UNAVAILABLE|DEADLINE_EXCEEDED|ABORTED")

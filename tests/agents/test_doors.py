@@ -243,9 +243,10 @@ def test_stoa_wrappers_reset_and_keep_the_final_observation():
     env = auto_reset.AutoResetWrapper(door.env, next_obs_in_extras=True)
     state, timestep = env.reset(jax.random.key(0))
     assert timestep.first()
+    # Params as an argument: with them as constants JAX 0.10.2 fails here where an eval_shape of a door came before.
     step = jax.jit(env.step)
     for _ in range(HORIZON):
-        state, timestep = step(state, ACTION)
+        state, timestep = step(state, ACTION, door.env.params)
     assert timestep.truncated() and timestep.discount == 1 and state.core.time == 0
     assert not np.allclose(timestep.observation, timestep.extras["next_obs"])
     env.environment_space()

@@ -39,13 +39,23 @@ def _perfect(batch):
             "occupancy": batch.occupancy == 1}
 
 
-def _evaluate(monkeypatch, config, predictions, batches, mean=None, other=None):
+def _evaluate(monkeypatch, config, predictions, batches, mean=None, other=None, look=None):
     """Every real window is a drive of its own; with `other` these frames are imagined under other actions."""
     answers = iter(predictions)
     monkeypatch.setattr(protocol, "_predict", lambda *_: (next(answers), other))
     windows = [protocol.Windows(batch, tuple(f"{index}-{row}" for row in range(count)))
                for index, (batch, count) in enumerate(batches)]
-    return protocol.evaluate(None, None, windows, config, mean)
+    return protocol.evaluate(None, None, windows, config, mean, look=look)
+
+
+def test_who_looks_sees_the_first_windows_as_every_source_has_them(monkeypatch, config):
+    seen, batches = [], [_batch(), _batch()]
+    _evaluate(monkeypatch, config, [_perfect(batch) for batch in batches], [(batch, 2) for batch in batches],
+              look=lambda item, guesses: seen.append((item.batch, guesses)))
+    (batch, guesses), = seen
+    assert batch is batches[0] and {"model", "copy_last"} <= guesses["imagined"].keys()
+    lengths = {phase: guesses[phase]["model"]["image"].shape[1] for phase in protocol.PHASES}
+    assert lengths == {"observed": config.data.context, "imagined": config.data.horizon}
 
 
 def test_two_processes_that_share_the_windows_report_what_one_does(monkeypatch, config):

@@ -245,7 +245,7 @@ def test_splits_share_training_weathers_or_hold_them_out_and_never_share_routes(
 
 
 def test_unknown_size_is_refused():
-    with pytest.raises(ValueError, match="'huge' is unknown; known are default, tiny"):
+    with pytest.raises(ValueError, match="'huge' is unknown; known are default, large, tiny"):
         record.jobs("huge")
 
 

@@ -11,8 +11,7 @@ from muvo_jax import config as config_lib
 from muvo_jax import limits, presets
 from muvo_jax.config import migration, parts, sizes
 
-SHIPPED = pathlib.Path(presets.__file__).parent / "builtin/town/config.json"  # of version 2
-KEPT = pathlib.Path(__file__).parent / "kept_runs"  # config.json of version 1
+KEPT = pathlib.Path(__file__).parent / "kept_runs"  # config.json of version 1, in version_2 of that
 
 
 @pytest.mark.parametrize("name", sorted(presets.PRESETS))
@@ -130,7 +129,7 @@ def test_version_1_from_before_it_had_all_of_its_fields_and_what_never_was():
 
 @pytest.mark.parametrize(("before", "today"), [(False, "none"), (True, "frames")])
 def test_runs_of_version_2_keep_what_they_compute_again(before, today):
-    stored = json.loads(SHIPPED.read_text())
+    stored = json.loads((KEPT / "version_2/town-tr.json").read_text())
     assert stored[migration.VERSION_FIELD] == 2
     assert config_lib.Config.from_dict(stored | {"train": stored["train"] | {"remat": before}}).train.remat == today
 

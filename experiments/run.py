@@ -82,6 +82,7 @@ def _results(options: Options, study: tables.Study, folder: pathlib.Path, planne
     runs: dict[str, dict[str, Any]] = {}
     for job in planned:
         runs.setdefault(job.label, {})[str(job.seed)] = queue.read(folder, job, study) or _recorded(existing, job)
+    _check_one_card([run for seeds in runs.values() for run in seeds.values() if run and "died" not in run], folder)
     kept = {name: existing[name] for name in ("command", "commit", "machine")} if existing else {}
     words = shlex.join(["python", "-m", "experiments.run", *sys.argv[1:]])
     return {"study": study.name, "scale": options.scale, "code": queue.code_fingerprint(), "data": options.data,
@@ -93,6 +94,19 @@ def _recorded(existing: dict[str, Any] | None, job: queue.Job) -> dict[str, Any]
     """What results of an earlier sitting say of a run whose folder is gone."""
     found = (existing or {}).get("runs", {}).get(job.label, {}).get(str(job.seed))
     return found if found and "died" not in found else None
+
+
+def _check_one_card(complete: list[dict[str, Any]], folder: pathlib.Path) -> None:
+    """Refuses to compare runs that were judged by several cards or on other samples.
+
+    Raises:
+      ValueError: naming both.
+    """
+    for split in tables.SPLITS:
+        cards = sorted({str(run["cards"].get(split)) for run in complete})
+        if len(cards) > 1:
+            raise ValueError(f"{folder} holds runs that were judged on {split} by {' and by '.join(cards)}. Evaluate "
+                             f"them by one (python -m muvo_jax.evaluate RUN), or begin anew with another --runs-dir.")
 
 
 def _check_same(existing: dict[str, Any], options: Options, study: tables.Study, path: pathlib.Path) -> None:

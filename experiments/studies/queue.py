@@ -152,7 +152,8 @@ def read(folder: pathlib.Path, job: Job, study: tables.Study) -> dict[str, Any] 
     """What came out of one run: None where there is nothing, {"died": text}, or scores and curves.
 
     Returns:
-      {"steps", "parameters", "processor_s", "protocol", "scores": {split: {metric: {"mean", "interval"}}},
+      {"steps", "parameters", "processor_s", "protocol", "cards": {split: card and samples},
+      "scores": {split: {metric: {"mean", "interval"}}},
       "baselines": the same of the training mean and of warp-last, "curves": {split: {metric: [[step, value], ...]}}}
     """
     run = folder / job.name
@@ -174,5 +175,5 @@ def read(folder: pathlib.Path, job: Job, study: tables.Study) -> dict[str, Any] 
                       for metric, name in study.curves.items()} for split in splits}
     cost = json.loads((run / COST).read_text(encoding="utf-8")) if (run / COST).is_file() else {}
     return {"steps": report["step"], "parameters": report["parameters"], **cost, "protocol": report["protocol"],
-            "scores": scores("model"),
+            "cards": {split: report["splits"][split]["card"] for split in splits}, "scores": scores("model"),
             "baselines": {source: scores(source) for source in ("training_mean", "warp_last")}, "curves": curves}

@@ -66,9 +66,9 @@ def claims(rows: Sequence[Mapping[str, Any]]) -> Table:
 def _how(results: Mapping[str, Any]) -> str:
     runs = [run for seeds in complete(results).values() for run in seeds.values()]
     hours = sum(run.get("processor_s", 0.0) for run in runs) / 3600.0
-    protocol = next((run["protocol"] for run in runs), "no run is complete yet")
+    judged = next((f"{run['protocol']}; {', '.join(run['cards'].values())}" for run in runs), "no run is complete yet")
     return (f"`{results['command']}` at commit {results['commit']} (code {results['code']}), on {results['machine']}; "
-            f"{len(runs)} runs, {hours:.1f} processor hours. Protocol: {protocol}. An effect is the mean difference of "
+            f"{len(runs)} runs, {hours:.1f} processor hours. Protocol: {judged}. An effect is the mean difference of "
             f"pairs of runs under one seed, positive where the claim's first arm is better, with Student's interval "
             f"over the pairs.")
 

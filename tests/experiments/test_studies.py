@@ -20,11 +20,12 @@ from muvo_jax.viz import curves
 ROOT = pathlib.Path(muvo_jax.__file__).parents[1]
 
 
-def _run_of(psnr, chamfer=1.0, step=400):
+def _run_of(psnr, chamfer=1.0, step=400, card="card town"):
     scores = {split: {tables.PSNR: {"mean": psnr - drop, "interval": [0, 0]},
                       tables.CHAMFER: {"mean": chamfer, "interval": [0, 0]}}
               for split, drop in zip(tables.SPLITS, (0.0, 1.0), strict=True)}
-    return {"steps": step, "parameters": 1000, "processor_s": 36.0, "protocol": "p", "scores": scores,
+    return {"steps": step, "parameters": 1000, "processor_s": 36.0, "protocol": "p",
+            "cards": dict.fromkeys(tables.SPLITS, card), "scores": scores,
             "baselines": {"training_mean": scores},
             "curves": {split: {tables.PSNR: [[1, 1.0], [2, psnr]]} for split in tables.SPLITS}}
 
@@ -200,6 +201,11 @@ def test_runs_that_results_have_scores_of_are_not_made_again_even_where_their_fo
     results = json.loads((out / report.RESULTS).read_text())
     assert results["command"] == "the first sitting's" and results["runs"]["NPT"]["0"]["steps"] == 400
     assert results["runs"]["PTF"]["0"] is None
+
+
+def test_runs_that_were_judged_by_two_cards_are_not_compared(tmp_path):
+    with pytest.raises(ValueError, match="on val_rl by card authors and by card town"):
+        study_command._check_one_card([_run_of(20.0), _run_of(21.0, card="card authors")], tmp_path)
 
 
 @pytest.mark.parametrize(("arguments", "message"), [

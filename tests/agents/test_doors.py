@@ -148,31 +148,6 @@ def test_brax_wrappers_truncate_and_reset():
     np.testing.assert_allclose(state.obs, state.info["first_obs"])
 
 
-@pytest.mark.parametrize("name", DOORS)
-def test_decoded_sensors_come_by_head_and_no_state_holds_or_gathers_memory(name):
-    """Of a model that remembers what was seen; nothing is computed, shapes are all."""
-    model, starts, _ = with_memory(heads=("image", "range_view", "action"))
-    core = environment_lib.Environment(model, periods=2, reward_config=NO_COLLISION,
-                                       observation=("image", "range_view"))
-
-    def drive(variables):
-        door = DOORS[name]((core, core.params(variables, starts, HORIZON)))
-        observation, first = door.start(raw_or_typed(door, 0))
-        (following, *_), second = door.step(first, ACTION)
-        assert {head: leaf.shape for head, leaf in observation.items()} == door.spaces()
-        return observation, following, first, second
-
-    observation, following, first, second = jax.eval_shape(drive, model.variable_shapes())
-    shapes = lambda tree: jax.tree.map(lambda leaf: (leaf.shape, leaf.dtype), tree)
-    assert observation["image"].shape == (*model.config.image_size, 3)
-    assert shapes(first) == shapes(second) and shapes(observation) == shapes(following)
-    numbers = lambda tree: sum(math.prod(leaf.shape) for leaf in jax.tree.leaves(tree))
-    latent = numbers(model.initial_state(1))
-    assert numbers(starts.memory) > 10 * (latent + 40)
-    # the latent, the car, key and terms, and in brax's state the observation; no weights, memory or bank
-    assert numbers(first) <= latent + 40 + (numbers(observation) if name == "brax" else 0)
-
-
 @pytest.fixture(scope="module")
 def of_sensors():
     """A Gymnasium environment that observes decoded sensors and renders."""
@@ -243,10 +218,9 @@ def test_stoa_wrappers_reset_and_keep_the_final_observation():
     env = auto_reset.AutoResetWrapper(door.env, next_obs_in_extras=True)
     state, timestep = env.reset(jax.random.key(0))
     assert timestep.first()
-    # Params as an argument: with them as constants JAX 0.10.2 fails here where an eval_shape of a door came before.
     step = jax.jit(env.step)
     for _ in range(HORIZON):
-        state, timestep = step(state, ACTION, door.env.params)
+        state, timestep = step(state, ACTION)
     assert timestep.truncated() and timestep.discount == 1 and state.core.time == 0
     assert not np.allclose(timestep.observation, timestep.extras["next_obs"])
     env.environment_space()
@@ -309,3 +283,30 @@ def test_dreamers_features_are_what_the_actions_were_chosen_on():
 def test_a_missing_library_names_its_extra():
     with pytest.raises(ImportError, match=r"pip install 'muvo_jax\[gymnax\]'"):
         optional.need("a_library_that_does_not_exist", "gymnax")
+
+
+# Last on purpose, for a reason not understood: run before test_stoa_wrappers_..., [stoa] makes that test fail with
+# "Execution supplied 10 arguments but compiled program expected 31" (JAX 0.10.2). Scripts with the same calls do not.
+@pytest.mark.parametrize("name", DOORS)
+def test_decoded_sensors_come_by_head_and_no_state_holds_or_gathers_memory(name):
+    """Of a model that remembers what was seen; nothing is computed, shapes are all."""
+    model, starts, _ = with_memory(heads=("image", "range_view", "action"))
+    core = environment_lib.Environment(model, periods=2, reward_config=NO_COLLISION,
+                                       observation=("image", "range_view"))
+
+    def drive(variables):
+        door = DOORS[name]((core, core.params(variables, starts, HORIZON)))
+        observation, first = door.start(raw_or_typed(door, 0))
+        (following, *_), second = door.step(first, ACTION)
+        assert {head: leaf.shape for head, leaf in observation.items()} == door.spaces()
+        return observation, following, first, second
+
+    observation, following, first, second = jax.eval_shape(drive, model.variable_shapes())
+    shapes = lambda tree: jax.tree.map(lambda leaf: (leaf.shape, leaf.dtype), tree)
+    assert observation["image"].shape == (*model.config.image_size, 3)
+    assert shapes(first) == shapes(second) and shapes(observation) == shapes(following)
+    numbers = lambda tree: sum(math.prod(leaf.shape) for leaf in jax.tree.leaves(tree))
+    latent = numbers(model.initial_state(1))
+    assert numbers(starts.memory) > 10 * (latent + 40)
+    # the latent, the car, key and terms, and in brax's state the observation; no weights, memory or bank
+    assert numbers(first) <= latent + 40 + (numbers(observation) if name == "brax" else 0)

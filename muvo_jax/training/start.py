@@ -83,6 +83,6 @@ def _from_run(run: pathlib.Path, show: screen.Screen, config: config_lib.Config,
     if (config.model.numerics != loaded.config.model.numerics
             or transfer.shapes(loaded.variables) != transfer.shapes(wanted)):
         variables = transfer.to_recording(loaded, config, wanted, frames)
-        taken = ", as far as this recording has its inputs; average frames are this recording's"
+        taken = ", as far as inputs and heads are the same; average frames are this recording's"
     show.field("weights", f"of step {loaded.step} of {run}{taken}")
     return ready.with_variables(variables, config)

@@ -17,21 +17,24 @@ from muvo_jax.training import checkpoint_meta, first_guess, validation
 
 def to_recording(loaded: run_lib.Run, config: config_lib.Config, wanted: types.Variables,
                  frames: pipeline.Frames) -> types.Variables:
-    """The variables of a run for a network that lacks route, navigation or speed among its inputs.
+    """The variables of a run for a network that lacks route, navigation or speed among its inputs, or has other heads.
 
-    What the old network knows of these is left out; the average frame and the spread of actions are measured on the
-    training frames, as a fresh model's are. Everything else stays.
+    What the old network knows of these is left out, and a head that it lacks starts fresh; the average frame and the
+    spread of actions are measured on the training frames, as a fresh model's are. Everything else stays.
 
     Args:
       loaded: what is taken over.
       config: of the new run, fitted to the recording.
-      wanted: the new network's variables, or their shapes.
+      wanted: the new network's fresh variables.
       frames: of the recording.
 
     Raises:
       ValueError: naming both networks where they differ in anything else.
     """
-    params = {name: value for name, value in loaded.variables["params"].items() if name in wanted["params"]}
+    fresh = {f"decoders_{head}" for head in config.model.heads if head not in loaded.config.model.heads}
+    old = loaded.variables["params"]
+    params = {name: value if name in fresh else old[name] for name, value in wanted["params"].items()
+              if name in fresh or name in old}
     ours, theirs = _token_kinds(config.model), _token_kinds(loaded.config.model)
     if isinstance(config.model.latent, config_lib.TokenLatent) and set(ours) < set(theirs):
         rows = np.array([theirs.index(kind) for kind in ours])
@@ -39,8 +42,8 @@ def to_recording(loaded: run_lib.Run, config: config_lib.Config, wanted: types.V
     if config.model.numerics != loaded.config.model.numerics or shapes(params) != shapes(wanted["params"]):
         checkpoint_meta.check_architecture(config, loaded.config, str(loaded.folder))
     measured = first_guess.measured(validation.training_sums(frames), config.model)
-    stats = {name: {**loaded.variables["batch_stats"].get(name, {}), **measured.get(name, {})}
-             for name in wanted["batch_stats"]}
+    stats = {name: {**(value if name in fresh else loaded.variables["batch_stats"].get(name, {})),
+                    **measured.get(name, {})} for name, value in wanted["batch_stats"].items()}
     return {"params": params, "batch_stats": stats}
 
 

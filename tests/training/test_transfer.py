@@ -60,3 +60,17 @@ def test_any_other_difference_is_refused_naming_both(town, kitti):
     wanted = world_model.WorldModel(wider.model).variable_shapes()
     with pytest.raises(ValueError, match=r"decoder_channels 8 \(stored\) against 16 \(asked for\)"):
         transfer.to_recording(town, wider, wanted, frames)
+
+
+def test_a_head_that_the_old_run_lacks_starts_fresh(town, kitti):
+    frames, config = kitti
+    heads = (*config.model.heads, "ego_motion")
+    config = dataclasses.replace(config, model=dataclasses.replace(config.model, heads=heads))
+    shapes = world_model.WorldModel(config.model).variable_shapes()
+    fresh = jax.tree.map(lambda leaf: np.full(leaf.shape, 0.5, leaf.dtype), shapes)
+    found = transfer.to_recording(town, config, fresh, frames)
+    assert transfer.shapes(found) == transfer.shapes(shapes)
+    jax.tree.map(np.testing.assert_array_equal, found["params"]["decoders_ego_motion"],
+                 fresh["params"]["decoders_ego_motion"])
+    jax.tree.map(np.testing.assert_array_equal, found["params"]["decoders_image"],
+                 town.variables["params"]["decoders_image"])

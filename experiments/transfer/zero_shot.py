@@ -11,7 +11,7 @@ import muvo_jax
 from muvo_jax import command_line, recordings
 from muvo_jax import config as config_lib
 from muvo_jax.data import fitting, pipeline
-from muvo_jax.training import checkpoint, loop, run_folder, transfer
+from muvo_jax.training import checkpoint, opening, run_folder, transfer
 
 
 def main(run: str, data: str, out: str, *settings: str) -> None:
@@ -23,7 +23,7 @@ def main(run: str, data: str, out: str, *settings: str) -> None:
     wanted = muvo_jax.WorldModel(config.model).variable_shapes()
     variables = transfer.to_recording(loaded, config, wanted, pipeline.Frames(recording, config))
     folder = pathlib.Path(out)
-    checkpoint.save_variables(folder, 0, variables, config=config, provenance=loop.provenance(recording, config))
+    checkpoint.save_variables(folder, 0, variables, config=config, provenance=opening.provenance(recording, config))
     run_folder.write_config(folder, config)
     print(f"wrote {folder}")
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import difflib
 import json
 import os
 import pathlib
@@ -16,6 +15,7 @@ import tyro
 
 from experiments.studies import cost, effects, queue, report, tables
 from muvo_jax import command_line
+from muvo_jax import config as config_lib
 from muvo_jax.data import processes
 from muvo_jax.training import screen
 
@@ -57,14 +57,6 @@ python -m experiments.run latent --scale=smoke
 python -m experiments.run fusion --shard=0/4  (on the first of four hosts)
 python -m experiments.run occupancy --scale=paper --data=/data/muvo  (says what it costs)
 """
-
-
-def _named(kind: str, name: str, known) -> str:
-    if name in known:
-        return name
-    near = difflib.get_close_matches(name, known, n=1)
-    raise ValueError(f"{kind} {name!r} is unknown; known are {', '.join(known)}."
-                     + (f" Did you mean {near[0]}?" if near else ""))
 
 
 def _shard(text: str) -> tuple[int, int]:
@@ -126,8 +118,9 @@ def _check_same(existing: dict[str, Any], options: Options, study: tables.Study,
 
 def run(options: Options, show: screen.Screen) -> None:
     """Does what the command line asks for."""
-    study = tables.STUDIES[_named("study", options.name, list(tables.STUDIES))]
-    scale = _named("scale", options.scale, list(tables.SCALES))
+    config_lib.check_choice("study", options.name, tuple(tables.STUDIES))
+    config_lib.check_choice("--scale", options.scale, tables.SCALES)
+    study, scale = tables.STUDIES[options.name], options.scale
     shard, seeds = _shard(options.shard), options.seeds or tables.SEEDS[scale]
     folder = options.runs_dir / f"{study.name}-{scale}"
     planned, extra = queue.jobs(study, scale, seeds), ([f"--data={options.data}"] if options.data else [])

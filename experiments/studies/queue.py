@@ -40,6 +40,11 @@ class Job:
     def name(self) -> str:
         return f"{self.label}-s{self.seed}"
 
+    @property
+    def after(self) -> str:
+        """The name of the run that this one starts from."""
+        return self.arm.after + self.name.removeprefix(self.arm.name)
+
 
 def jobs(study: tables.Study, scale: str, seeds: int) -> list[Job]:
     """All runs without memory: every arm under the first seed, then under the next."""
@@ -48,8 +53,9 @@ def jobs(study: tables.Study, scale: str, seeds: int) -> list[Job]:
 
 def of_shard(planned: Sequence[Job], shard: int, shards: int) -> list[Job]:
     """The part of the runs that one of several hosts makes; what comes after another run stays with it."""
-    chains = list(dict.fromkeys((job.arm.after or job.arm.name, job.seed) for job in planned))
-    return [job for job in planned if chains.index((job.arm.after or job.arm.name, job.seed)) % shards == shard]
+    root = lambda job: (job.arm.after or job.arm.name, job.seed)
+    chains = list(dict.fromkeys(map(root, planned)))
+    return [job for job in planned if chains.index(root(job)) % shards == shard]
 
 
 def code_fingerprint() -> str:
@@ -72,7 +78,6 @@ def commit() -> str:
 
 def flags(study: tables.Study, scale: str, job: Job, folder: pathlib.Path, extra: Sequence[str] = ()) -> list[str]:
     """What muvo_jax.train is called with for a fresh run; all --set of study, arm and memory become one."""
-    after = folder / Job(job.arm, job.seed, job.memory).name.replace(job.arm.name, job.arm.after, 1)
     plain, settings = [], []
     parts = [study.base[scale], job.arm.flags, tuple(tables.MEMORY.split()) if job.memory else (), tuple(extra)]
     for part in parts:
@@ -84,7 +89,7 @@ def flags(study: tables.Study, scale: str, job: Job, folder: pathlib.Path, extra
     result = [*plain, f"--seed={job.seed}", f"--name={job.name}", f"--runs-dir={folder}"]
     if latest:
         result += ["--set", *(f"{name}={value}" for name, value in latest.items())]
-    return [word.replace("{after}", str(after)) for word in result]
+    return [word.replace("{after}", str(folder / job.after)) for word in result]
 
 
 def make(study: tables.Study, scale: str, job: Job, folder: pathlib.Path, say: Callable[[str], None],

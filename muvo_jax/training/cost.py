@@ -77,6 +77,12 @@ def of_step(config: config_lib.Config, batch_shapes: types.Batch,
                     operations(traced.jaxpr.jaxpr), time.perf_counter() - start_s)
 
 
+def operations_of(planned: preparation.Planned) -> float:
+    """Floating-point operations of a step's products and convolutions, traced but not compiled."""
+    jitted: Any = planned.step.compiled
+    return operations(jitted.trace(planned.state, planned.batch).jaxpr.jaxpr)
+
+
 def operations(jaxpr: Any) -> float:
     """Floating-point operations of all products and convolutions in a jaxpr, on each device, loops counted as often as
     they run; of branches the dearest (the platforms' forms of a convolution are branches)."""

@@ -95,7 +95,8 @@ def operations(jaxpr: Any) -> float:
         elif equation.primitive.name == "conv_general_dilated":
             kernel = equation.invars[1].aval.shape
             outputs = kernel[equation.params["dimension_numbers"].rhs_spec[0]]
-            total += 2.0 * math.prod(equation.outvars[0].aval.shape) * math.prod(kernel) / outputs
+            between = math.prod(equation.params["lhs_dilation"])  # of so many inputs all but one are zeros put between
+            total += 2.0 * math.prod(equation.outvars[0].aval.shape) * math.prod(kernel) / outputs / between
         elif equation.primitive.name == "cond":
             total += max(operations(branch.jaxpr) for branch in equation.params["branches"])
         else:

@@ -29,6 +29,9 @@ def test_operations_of_products_convolutions_loops_and_gradients_by_hand():
     assert of(again, (3, 5), (5, 5)) == 5 * 2 * 3 * 5 * 5  # two forward, one of them again, two back
     layer = lambda x, kernel: conv.conv(x, kernel, padding=1, implementation="xla")
     assert of(layer, (2, 8, 8, 3), (3, 3, 3, 4)) == 2 * 2 * 8 * 8 * 9 * 3 * 4
+    axes = ("NHWC", "HWIO", "NHWC")
+    larger = lambda x, kernel: jax.lax.conv_transpose(x, kernel, (2, 2), "SAME", dimension_numbers=axes)
+    assert of(larger, (2, 8, 8, 3), (4, 4, 3, 5)) == 2 * 2 * 8 * 8 * 16 * 3 * 5  # each input meets the kernel once
 
 
 def test_a_rate_is_that_of_a_processor():

@@ -20,8 +20,6 @@ if not hasattr(jax, "device_put_replicated"):
     jax.device_put_replicated = lambda tree, devices: jax.tree.map(lambda leaf: jnp.stack([leaf] * len(devices)), tree)
 
 
-
-
 def train(env, steps, seed=0, restore=None, **options):
     """Brax's PPO; (make_policy, params, metrics) of brax."""
     return ppo.train(

@@ -4,12 +4,10 @@ import jax
 import jax.numpy as jnp
 
 import muvo_jax
-from muvo_jax import presets, town_drive, train_agent
+from muvo_jax import drive, presets, town_drive, train_agent
 from muvo_jax.agents import closed_loop, drive_scores, environment, futures, rewards
 from muvo_jax.town import settings, simulator
-from muvo_jax.training import checkpoint
-
-SPEED_LIMIT_MPS = 8.0  # as train_agent and drive have it
+from muvo_jax.training import checkpoint, screen
 
 
 def load(run: str | None, horizon: int) -> tuple[environment.Environment, environment.EnvParams]:
@@ -44,7 +42,7 @@ class Dreams:
     def __init__(self, run: str, starts: int = 128):
         self.run = checkpoint.load_run(run, "latest")
         self.world = environment.Environment.of_run(self.run, observation="road", reward_config=rewards.RewardConfig(
-            speed_limit_mps=SPEED_LIMIT_MPS))
+            speed_limit_mps=train_agent.Options.speed_limit_mps))
         self.recorded = train_agent.recorded_params(self.world, self.run, starts)
         self.core = futures.SharedFutures(self.world)
 
@@ -61,11 +59,8 @@ class Dreams:
         simulated = town_drive.town_simulator(town, self.run.config)
         drivers = {"policy": closed_loop.policy_driver(simulated, self.world, self.run.variables, policy),
                    "expert": closed_loop.expert_driver(simulated)}
-        steps, context = round(10.0 / simulated.step_s), self.run.config.data.context
-        driven = {name: [closed_loop.drive(simulated, driver, jax.random.fold_in(jax.random.key(0), seed), seed, steps,
-                                           context=context)
-                         for seed in range(town_drive.FIRST_SEED, town_drive.FIRST_SEED + drives)]
-                  for name, driver in drivers.items()}
+        seeds = list(range(town_drive.FIRST_SEED, town_drive.FIRST_SEED + drives))
+        driven = drive.drive_all(drive.Options(self.run.folder), self.run, simulated, drivers, seeds, screen.Screen())
         found = drive_scores.summarise(driven, route_m=town.config.route_m, step_s=simulated.step_s, expert="expert")
         score = found["policy"]
         low, high = score["success_interval"]

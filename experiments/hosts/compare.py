@@ -31,14 +31,13 @@ SIZES = ("model.image_size=[32,64]", "model.range_view.rows=32", "model.range_vi
 RANDOM = ("model.fusion.dropout=0.2", "model.prior_dropout=0.3")
 OFTEN = ("train.log_every=1", "train.validate_every=10", "train.checkpoint_every=10", "train.preview_every=0",
          "train.validation_windows=4", "evaluation.batch=2")
-CLOCK = ("steps_per_s", "waiting_percent")
 
 
 def train(out: pathlib.Path, hosts: int, options: argparse.Namespace) -> list[dict]:
     """What a training over that many processes logs; one that --out holds already is not repeated."""
     folder = out / f"hosts-{hosts}"
     if (folder / "checkpoints" / str(options.steps)).exists():
-        return logged(folder)
+        return run_folder.reproducible_metrics(folder)
     with socket.socket() as free:
         free.bind(("localhost", 0))
         port = free.getsockname()[1]
@@ -55,11 +54,7 @@ def train(out: pathlib.Path, hosts: int, options: argparse.Namespace) -> list[di
     codes = [process.wait() for process in running]
     if any(codes):
         raise SystemExit(f"{hosts} hosts ended with {codes}: {out}/hosts-{hosts}-*.log")
-    return logged(folder)
-
-
-def logged(folder: pathlib.Path) -> list[dict]:
-    return [record for record in run_folder.read_metrics(folder) if record["kind"] != "time"]
+    return run_folder.reproducible_metrics(folder)
 
 
 def furthest(ours: list[dict], theirs: list[dict]) -> tuple[float, str]:
@@ -68,7 +63,7 @@ def furthest(ours: list[dict], theirs: list[dict]) -> tuple[float, str]:
         return math.inf, "other records"
     apart = [(abs(one[name] - value) / max(abs(value), 1e-6), f"{name} of {one['kind']} {one['step']}")
              for one, other in zip(ours, theirs, strict=True) for name, value in other.items()
-             if name not in CLOCK and isinstance(value, float)]
+             if isinstance(value, float)]
     return max(apart)
 
 

@@ -22,7 +22,6 @@ import numpy as np
 
 from muvo_jax.training import checkpoint, run_folder
 
-CLOCK = ("steps_per_s", "waiting_percent")
 OFTEN = ("train.log_every=1", "train.checkpoint_every=3", "train.validate_every=8", "train.preview_every=0")
 
 
@@ -32,14 +31,8 @@ def start(out: pathlib.Path, name: str, flags: list[str]) -> subprocess.Popen:
         return subprocess.Popen(command, stdout=log, stderr=subprocess.STDOUT)
 
 
-def logged(folder: pathlib.Path) -> list[dict]:
-    """Records of steps and validations without what depends on the clock."""
-    return [{name: value for name, value in record.items() if name not in CLOCK}
-            for record in run_folder.read_metrics(folder) if record["kind"] != "time"]
-
-
 def last_step(folder: pathlib.Path) -> int:
-    return max((record["step"] for record in logged(folder) if record["kind"] == "train"), default=0)
+    return max((record["step"] for record in run_folder.read_metrics(folder) if record["kind"] == "train"), default=0)
 
 
 def kill_at(process: subprocess.Popen, folder: pathlib.Path, step: int | None, delay_s: float) -> bool:
@@ -88,7 +81,7 @@ def main() -> int:
     if process.wait():
         raise SystemExit(f"the killed training did not go on: {out}/killed.log")
 
-    ours, theirs = logged(killed), logged(alone)
+    ours, theirs = run_folder.reproducible_metrics(killed), run_folder.reproducible_metrics(alone)
     wrong = [index for index, (one, other) in enumerate(zip(ours, theirs, strict=False)) if one != other]
     final = [jax.tree.leaves(checkpoint.load_run(folder).variables) for folder in (killed, alone)]
     same = all(np.array_equal(one, other) for one, other in zip(*final, strict=True))

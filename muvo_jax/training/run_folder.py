@@ -14,7 +14,7 @@ import tensorboardX
 
 from muvo_jax import config as config_lib
 from muvo_jax.data import processes
-from muvo_jax.training import checkpoint, together
+from muvo_jax.training import checkpoint, timing, together
 
 CONFIG_FILE = "config.json"
 METRICS_FILE = "metrics.jsonl"
@@ -135,6 +135,12 @@ def read_metrics(path: str | os.PathLike) -> list[dict[str, Any]]:
         except json.JSONDecodeError:
             continue
     return records
+
+
+def reproducible_metrics(path: str | os.PathLike) -> list[dict[str, Any]]:
+    """The records of a run without what depends on the clock: those of the same run made again are equal."""
+    return [{name: value for name, value in record.items() if name not in timing.OF_THE_CLOCK}
+            for record in read_metrics(path) if record["kind"] != "time"]
 
 
 def forget_after(path: str | os.PathLike, step: int) -> int:

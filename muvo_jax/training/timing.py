@@ -14,6 +14,7 @@ import jax
 from muvo_jax import config as config_lib
 from muvo_jax.training import screen
 
+OF_THE_CLOCK = ("steps_per_s", "waiting_percent")  # fields of records that another run of the same has otherwise
 TRACED = range(3, 8)  # steps after a start: the first ones touch memory that later ones have
 
 

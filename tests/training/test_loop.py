@@ -115,11 +115,7 @@ def _train(folder, show=None, config=None, **options):
     return loop.train(job, show or Interrupting())
 
 
-def _losses(folder):
-    """Everything that was logged and does not depend on the clock."""
-    clock = {"steps_per_s", "waiting_percent"}
-    return [{name: value for name, value in record.items() if name not in clock}
-            for record in run_folder.read_metrics(folder) if record["kind"] != "time"]
+_logged = run_folder.reproducible_metrics
 
 
 def _final(folder):
@@ -142,7 +138,7 @@ def test_a_run_leaves_its_files_and_says_what_it_does(uninterrupted):
     folder, outcome, _, text = uninterrupted
     assert (outcome.step, outcome.stopped) == (STEPS, False)
     assert run_folder.read_config(folder) == outcome.config
-    kinds = [(record["kind"], record["step"]) for record in _losses(folder)]
+    kinds = [(record["kind"], record["step"]) for record in _logged(folder)]
     assert [step for kind, step in kinds if kind == "train"] == [1, 2, 3, 4, 5, 6]
     assert [step for kind, step in kinds if kind == "validation"] == [3, 6]
     assert {path.name for path in (folder / "checkpoints").iterdir()} >= {"4", "6"}
@@ -169,7 +165,7 @@ def test_some_steps_are_traced_where_asked_for(tmp_path):
 
 
 def test_validation_reports_loss_and_imagined_scores(uninterrupted):
-    record = next(record for record in _losses(uninterrupted[0]) if record["kind"] == "validation")
+    record = next(record for record in _logged(uninterrupted[0]) if record["kind"] == "validation")
     assert record["split"] == "val_rl"
     assert np.isfinite([record[name] for name in ("total", "psnr_db", "imagined_psnr_db", "copy_last_psnr_db",
                                                   "action_shuffle_image", "skill")]).all()
@@ -177,7 +173,7 @@ def test_validation_reports_loss_and_imagined_scores(uninterrupted):
 
 def test_the_best_checkpoint_is_the_most_skilful_one(uninterrupted):
     folder = uninterrupted[0]
-    skills = {record["step"]: record["skill"] for record in _losses(folder) if record["kind"] == "validation"}
+    skills = {record["step"]: record["skill"] for record in _logged(folder) if record["kind"] == "validation"}
     kept = checkpoint_meta.read(folder / "checkpoints" / "6")
     assert kept["score"] == pytest.approx(skills[6])
 
@@ -207,7 +203,7 @@ def test_ctrl_c_saves_and_says_how_to_go_on(tmp_path, uninterrupted):
 
 def _assert_equal_runs(folder, uninterrupted):
     """The same records, each once, and the same parameters."""
-    assert _losses(folder) == _losses(uninterrupted[0])
+    assert _logged(folder) == _logged(uninterrupted[0])
     jax.tree.map(np.testing.assert_array_equal, _final(folder), uninterrupted[2])
 
 

@@ -12,11 +12,12 @@ import time
 import numpy as np
 import pytest
 
+from muvo_jax.training import timing
+
 HERE = pathlib.Path(__file__).parent
 ROOT = HERE.parents[1]
 STEPS, DEVICES = 6, 2
 MINUTES = 15
-CLOCK = ("steps_per_s", "waiting_percent")
 pytestmark = pytest.mark.slow
 
 
@@ -63,7 +64,7 @@ def ended(processes):
 def logged(folder):
     """All records that do not tell the time, oldest first."""
     records = [json.loads(line) for line in (folder / "metrics.jsonl").read_text().splitlines()]
-    return [{name: value for name, value in record.items() if name not in CLOCK}
+    return [{name: value for name, value in record.items() if name not in timing.OF_THE_CLOCK}
             for record in records if record["kind"] != "time"]
 
 

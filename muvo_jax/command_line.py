@@ -63,6 +63,7 @@ def run(options_type: type[_Options], work: Callable[[_Options, screen.Screen], 
     """
     given = sys.argv[1:] if arguments is None else arguments
     check_options(options_type, program, given)
+    given = gathered(options_type, given)
     paragraphs = [inspect.getdoc(options_type) or "", "Examples:", *examples.strip().splitlines()]
     description = "\n\n".join(paragraphs)  # the help joins lines, but not paragraphs
     called = sys.argv[0] if sys.argv[0].startswith("muvo ") else f"python -m muvo_jax.{program}"
@@ -121,6 +122,25 @@ def check_options(options_type: type, program: str, arguments: Sequence[str]) ->
         hint = f"did you mean {' or '.join(near)}?" if near else "the options are " + " ".join(known)
         print(f"error: unknown option {option_name}; {hint} (python -m muvo_jax.{program} --help)", file=sys.stderr)
         raise SystemExit(2)
+
+
+def gathered(options_type: type, arguments: Sequence[str]) -> list[str]:
+    """The arguments with options that take many values once each: --set A=1 --set B=2 means both, and the parser would
+    take the last one alone."""
+    many = {f"--{field.name.replace('_', '-')}" for field in dataclasses.fields(options_type) if field.default == ()}
+    named = [argument.partition("=")[0] for argument in arguments if argument.startswith("--")]
+    rest: list[str] = []
+    values: dict[str, list[str]] = {name: [] for name in many if named.count(name) > 1}
+    into = rest
+    for argument in arguments:
+        name, equals, value = argument.partition("=")
+        if argument.startswith("--"):
+            into = values.get(name, rest)
+        if into is rest or not argument.startswith("--"):
+            into.append(argument)
+        elif equals:
+            into.append(value)
+    return rest + [word for name, words in values.items() for word in (name, *words)]
 
 
 def check_numbers(options: Any) -> None:

@@ -211,6 +211,14 @@ def test_a_flag_beats_the_preset_and_set_reaches_everything():
     assert folder == pathlib.Path("runs/tiny-tr")
 
 
+def test_set_may_be_given_again_and_again():
+    given = []
+    for arguments in (["--set", "a.b=1", "c=2", "--set=d=x=y", "--name", "run", "--set", "c=3"],
+                      ["--name=run", "--set", "a.b=1", "c=2", "d=x=y", "c=3"]):
+        command_line.run(train.Options, lambda options, _: given.append(options), program="train", arguments=arguments)
+    assert given[0] == given[1] and given[0].set == ("a.b=1", "c=2", "d=x=y", "c=3")
+
+
 def test_default_names_tell_runs_apart():
     names = [train.default_name(options) for options in (
         train.Options(), train.Options(preset="paper", fusion="tr"), train.Options(data="/data/kitti_raw"),

@@ -133,8 +133,7 @@ def profile(config: config_lib.Config, rounds: int, rate: float) -> None:
 def updates(config: config_lib.Config, batch: Batch):
     """A function that makes one update after the other, the step, and its first arguments as shapes."""
     model = muvo_jax.WorldModel(config.model)
-    held = [state.create(model.init(jax.random.key(0)), optimizer.make_optimizer(
-        config.optimizer, config.train.steps), jax.random.key(1))]
+    held = [state.create(model.init(jax.random.key(0)), optimizer.of_config(config), jax.random.key(1))]
     train = step.make_train_step(model, config)
     placed = train.place(batch)
     shapes = jax.eval_shape(lambda *arguments: arguments, held[0], placed)

@@ -93,6 +93,8 @@ class TrainConfig:
       restart: the observed frames of a training window are cut in two at a frame drawn anew in each step, so that the
         filter is trained on 1 to observe_frames of them.
       parallel: "auto" uses shard_map over all devices where there is more than one.
+      share_state: whether each device keeps only its share of parameters and of the optimiser's moments, gathered for a
+        step: for models that do not fit otherwise. With shard_map alone.
       non_finite: what a batch does whose loss or gradient is not finite; none changes a parameter. "stop" ends the run
         with an error, "skip" goes on and counts it in metrics.jsonl (ten in a row are an error too).
       remat: what is computed again for the gradients instead of kept. "heads": what heads decode, one frame after the
@@ -115,6 +117,7 @@ class TrainConfig:
     keep_last: Annotated[int, NOT_NEGATIVE] = 2
     keep_best: Annotated[int, NOT_NEGATIVE] = 1
     parallel: Literal["auto", "pmap", "shard_map"] = "auto"
+    share_state: bool = False
     non_finite: Literal["stop", "skip"] = "stop"
     remat: Literal["none", "heads", "frames"] = "none"
     decode_frames: Annotated[int, NOT_NEGATIVE] = 0

@@ -4,17 +4,21 @@ A checkpoint is one folder per step with three items, `variables` (all that infe
 state, run key, step) and `meta` (config, action contract, package versions, where the data came from, position in the
 data), and a list of the SHA-256 of every file, written last. A folder without that list, or with a file that differs
 from it, was interrupted or damaged; `restore_latest` then takes the one before and says so.
+
+Training goes on while a checkpoint is written: `save` returns once the state is copied. The checkpoints before stay
+until the new one is whole.
 """
 
 from __future__ import annotations
 
+import concurrent.futures
 import dataclasses
 import logging
 import os
 import pathlib
 import shutil
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, NoReturn
 
 import jax
 import orbax.checkpoint as ocp
@@ -52,8 +56,20 @@ class Restored:
     warnings: tuple[str, ...]
 
 
+@dataclasses.dataclass(frozen=True)
+class _Writing:
+    """A save under way: of which step, and what becomes of it."""
+
+    step: int
+    outcome: concurrent.futures.Future
+
+
 class Checkpoints:
-    """The checkpoints of one run: RUN/checkpoints/STEP. Several processes call the same methods together."""
+    """The checkpoints of one run: RUN/checkpoints/STEP. Several processes call the same methods together.
+
+    Attributes:
+      saved: the newest step that this object knows to be written whole; None where there is none yet.
+    """
 
     def __init__(self, run_folder: str | os.PathLike, *, keep_last: int = 2, keep_best: int = 1):
         """Keeps the `keep_last` newest (at least two: a damaged one needs a predecessor) and the best by score."""
@@ -64,10 +80,13 @@ class Checkpoints:
             _preservation.LatestN(max(2, keep_last)),
             _preservation.BestN(get_metric_fn=_score, n=keep_best, keep_checkpoints_without_metrics=False)])
         self._manager = self._open()
+        self._background = concurrent.futures.ThreadPoolExecutor(1, "checkpoints")
+        self._writing: _Writing | None = None
+        self.saved: int | None = None
 
     def _open(self) -> ocp.CheckpointManager:
-        options = ocp.CheckpointManagerOptions(preservation_policy=self._policy, enable_async_checkpointing=False,
-                                               create=True, cleanup_tmp_directories=True,
+        options = ocp.CheckpointManagerOptions(preservation_policy=self._policy, create=True,
+                                               cleanup_tmp_directories=True,
                                                best_fn=_score)  # or scores would not be there when a run goes on
         return ocp.CheckpointManager(self.folder, options=options, item_names=("variables", "training", "meta"))
 
@@ -76,8 +95,11 @@ class Checkpoints:
         return _steps(self.folder)
 
     def save(self, step: int, state, *, config: config_lib.Config, data_state=None, score: float | None = None,
-             provenance: Mapping[str, Any] | None = None) -> pathlib.Path:
-        """Writes one checkpoint; it counts as readable only once its checksums are there.
+             provenance: Mapping[str, Any] | None = None) -> None:
+        """Starts to write one checkpoint, once the one before is there; `wait` ends when it is.
+
+        The state may be changed or donated as soon as this returns. The checkpoint counts as readable only once its
+        checksums are there.
 
         Args:
           step: updates done.
@@ -88,33 +110,60 @@ class Checkpoints:
           provenance: what the data is.
 
         Raises:
-          CheckpointError: where writing failed (disk full); earlier checkpoints stay untouched.
+          CheckpointError: where writing failed (disk full), of this one or of the one before; earlier checkpoints stay
+            untouched.
         """
+        self.wait()
         meta = checkpoint_meta.describe(step, config, provenance, data_state, score)
         items = ocp.args.Composite(
             variables=ocp.args.StandardSave({"params": state.params, "batch_stats": state.batch_stats}),
             training=ocp.args.StandardSave({"opt_state": state.opt_state, "key": state.key, "step": state.step}),
             meta=ocp.args.JsonSave(meta))
-        folder = self.folder / str(step)
         try:
-            if together.any_of(folder.exists()):  # an interrupted or damaged save of the same step
+            if together.any_of((self.folder / str(step)).exists()):  # an interrupted or damaged save of the same step
                 self.set_aside([step])
             self._manager.save(step, args=items, metrics=None if score is None else {"score": score}, force=True)
-            self._manager.wait_until_finished()
-            if together.is_first():
-                integrity.seal(folder)
+        except Exception as error:
+            self._failed(step, error)
+        self._writing = _Writing(step, self._background.submit(self._seal, step))
+
+    def _seal(self, step: int) -> None:
+        self._manager.wait_until_finished()
+        if together.is_first():
+            integrity.seal(self.folder / str(step))
+
+    def check(self) -> None:
+        """Raises CheckpointError where the save under way is known to have failed."""
+        if self._writing is not None and self._writing.outcome.done() and self._writing.outcome.exception():
+            self.wait()
+
+    def wait(self) -> None:
+        """Returns once nothing is being written any more.
+
+        Raises:
+          CheckpointError: where writing failed.
+        """
+        writing, self._writing = self._writing, None
+        if writing is None:
+            return
+        try:
+            writing.outcome.result()
             together.wait_for_all("the checkpoint is sealed")
-        except Exception as error:  # Orbax and TensorStore raise OSError, ValueError or RuntimeError for a full disk
-            if together.is_loss(error) or not together.is_first():
-                raise
-            shutil.rmtree(folder, ignore_errors=True)
-            self._discard_partial_saves()
-            kept = [str(other) for other in self.steps() if integrity.damage(self.folder / str(other)) is None]
-            raise CheckpointError(
-                f"checkpoint of step {step} could not be written to {self.folder}: {_first_line(error)}. "
-                f"Is the disk full, or the folder read-only? Readable checkpoints: {', '.join(kept) or 'none'}. Mend "
-                f"that and go on with --resume.") from error
-        return folder
+        except Exception as error:
+            self._failed(writing.step, error)
+        self.saved = writing.step
+
+    def _failed(self, step: int, error: Exception) -> NoReturn:
+        """Orbax and TensorStore raise OSError, ValueError or RuntimeError for a full disk."""
+        if together.is_loss(error) or not together.is_first():
+            raise error
+        shutil.rmtree(self.folder / str(step), ignore_errors=True)
+        self._discard_partial_saves()
+        kept = [str(other) for other in self.steps() if integrity.damage(self.folder / str(other)) is None]
+        raise CheckpointError(
+            f"checkpoint of step {step} could not be written to {self.folder}: {_first_line(error)}. Is the disk full, "
+            f"or the folder read-only? Readable checkpoints: {', '.join(kept) or 'none'}. Mend that and go on with "
+            f"--resume.") from error
 
     def _discard_partial_saves(self) -> None:
         for path in self.folder.glob("*orbax-checkpoint-tmp*"):
@@ -136,6 +185,7 @@ class Checkpoints:
           CheckpointError: where there are checkpoints but none can be read.
           ValueError: where they belong to another architecture, or other parameters trained; names both.
         """
+        self.wait()
         warnings: list[str] = []
         abstract = jax.tree.map(_abstract, like)
         for step in reversed(self.steps()):
@@ -149,6 +199,7 @@ class Checkpoints:
                 except Exception as error:  # whatever Orbax raises: the checkpoint before may still be good
                     reason = f"it cannot be restored ({_first_line(error)})"
                 else:
+                    self.saved = step
                     return Restored(state, step, checkpoint_meta.read_data_state(meta), meta, tuple(warnings))
             warnings.append(f"checkpoint {path} is damaged: {reason}; trying the one before.")
         if warnings:
@@ -171,6 +222,8 @@ class Checkpoints:
         return moved
 
     def close(self) -> None:
+        """Lets a save under way end, well or not: `wait` first to know."""
+        self._background.shutdown()
         self._manager.close()
 
 

@@ -77,13 +77,18 @@ def check_architecture(wanted: config_lib.Config, stored: config_lib.Config, whe
 
 
 def check_resumable(wanted: config_lib.Config, stored: config_lib.Config, where: str) -> None:
-    """As `check_architecture`, and ValueError where other parameters trained: the optimiser's state is of those."""
+    """As `check_architecture`, and ValueError where the optimiser's state is another: of other parameters, or kept in
+    another way."""
     check_architecture(wanted, stored, where)
     ours, theirs = wanted.train.trainable, stored.train.trainable
     if ours != theirs:
         raise ValueError(f"{where} was trained with train.trainable={theirs}, and cannot go on with {ours}: the "
                          f"optimiser's state belongs to what trains. Start another run from its weights, with --init "
                          f"and a new --name.")
+    if wanted.train.share_state != stored.train.share_state:
+        raise ValueError(f"{where} was trained with train.share_state={stored.train.share_state}, and cannot go on "
+                         f"with {wanted.train.share_state}: the optimiser's state is kept in another way. Start "
+                         f"another run from its weights, with --init and a new --name.")
 
 
 def package_versions() -> dict[str, str | None]:

@@ -25,6 +25,7 @@ from muvo_jax.training import (
     checkpoint_meta,
     host,
     opening,
+    parallel,
     preparation,
     run_folder,
     screen,
@@ -168,7 +169,8 @@ class _Run:
                  state, done: int, origin: Mapping):
         self.job, self.show, self.config, self.ready = job, show, config, ready
         self.keeper, self.files, self.validator, self.origin = keeper, files, validator, origin
-        self.state, self.done, self.saved = state, done, done if keeper.steps() else None
+        self.state, self.done = state, done
+        self.asked_to_save = done if keeper.saved is not None else None  # the step of the newest checkpoint or save
         self.skipped = 0  # in a row
         self.step_times_s: list[float] = []
         self.spent = timing.Spent()
@@ -202,6 +204,7 @@ class _Run:
                     self._first_loss(float(metrics["total"]), making_s)
                     pace.restart()
                 if due.log:
+                    self.keeper.check()
                     self._log(metrics, None if first else pace.mark(settings.steps - self.done))
                 if due.any_pause and self.done < settings.steps:
                     self._pause(due, feed.get_state())
@@ -233,10 +236,12 @@ class _Run:
         if self.config.train.non_finite == "skip" and self.skipped < _MOST_SKIPPED:
             self.show.warn(f"step {step}: the loss is not finite: {', '.join(bad)}. The batch is skipped.")
             return
+        self.keeper.wait()
+        saved = self.keeper.saved
         raise NonFiniteLossError(
             f"step {step}: the loss is not finite: {', '.join(bad)}. "
-            + (f"The last good checkpoint is of step {self.saved}, in {self.keeper.folder / str(self.saved)}."
-               if self.saved is not None else "There is no checkpoint yet.")
+            + (f"The last good checkpoint is of step {saved}, in {self.keeper.folder / str(saved)}."
+               if saved is not None else "There is no checkpoint yet.")
             + " Try a lower --learning-rate, or gradient clipping: --set optimizer.clip_norm=1. Where few batches are "
               "bad, --set train.non_finite=skip leaves them out.")
 
@@ -284,16 +289,19 @@ class _Run:
         return mean if math.isfinite(mean) else None
 
     def _preview(self) -> None:
-        if self.job.preview is not None and together.is_first():
-            with self.spent.on("pictures"):
-                self.job.preview(self.job.folder / run_folder.PREVIEW_FOLDER, self.validator, self.state.variables,
+        if self.job.preview is None:
+            return
+        with self.spent.on("pictures"):
+            variables = parallel.on_device(self.state.variables, jax.local_devices()[0])  # of all hosts that share it
+            if together.is_first():
+                self.job.preview(self.job.folder / run_folder.PREVIEW_FOLDER, self.validator, variables,
                                  f"step_{self.done:06d}")
 
     def _save(self, data_state, score: float | None = None) -> None:
         with self.spent.on("checkpoints"):
             self.keeper.save(self.done, self.state, config=self.config, data_state=data_state, score=score,
                              provenance=self.origin)
-        self.saved = self.done
+        self.asked_to_save = self.done
 
     def _finish(self, stopped: bool, data_state) -> None:
         total = self.config.train.steps
@@ -302,8 +310,10 @@ class _Run:
             score = self._validate()
             self._preview()
             self._save(data_state, score)
-        elif self.step_times_s and self.saved != self.done:
+        elif self.step_times_s and self.asked_to_save != self.done:
             self._save(data_state)
+        with self.spent.on("checkpoints"):
+            self.keeper.wait()
         if stopped and self.done < total:
             self.show.line(f"stopped at step {self.done} of {total}; saved. Go on with:  {self.job.resume_command}")
         steady_s = self.step_times_s[1:]

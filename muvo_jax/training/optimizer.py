@@ -60,12 +60,23 @@ def beta1(config: config_lib.OptimizerConfig, total_steps: int) -> Schedule:
                      warmup_fraction=config.warmup_fraction)
 
 
-def make_optimizer(config: config_lib.OptimizerConfig, total_steps: int) -> optax.GradientTransformation:
-    """AdamW on trees with both schedules, after clipping by the global norm if `clip_norm` > 0."""
+def make_optimizer(config: config_lib.OptimizerConfig, total_steps: int, *,
+                   leaf_by_leaf: bool = False) -> optax.GradientTransformation:
+    """AdamW on trees with both schedules, after clipping by the global norm if `clip_norm` > 0.
+
+    Its state is packed into two vectors (`packed`), or `leaf_by_leaf` like the parameters, which takes longer to
+    compile and lets devices share it as they share the parameters.
+    """
     adamw = optax.inject_hyperparams(optax.adamw, static_args=("mask",))(
         learning_rate=learning_rate(config, total_steps), b1=beta1(config, total_steps), b2=config.beta2,
         eps=config.epsilon, weight_decay=config.weight_decay, mask=decays)
-    return packed(optax.chain(optax.clip_by_global_norm(config.clip_norm), adamw) if config.clip_norm > 0.0 else adamw)
+    clipped = optax.chain(optax.clip_by_global_norm(config.clip_norm), adamw) if config.clip_norm > 0.0 else adamw
+    return clipped if leaf_by_leaf else packed(clipped)
+
+
+def of_config(config: config_lib.Config) -> optax.GradientTransformation:
+    """The optimiser of a run."""
+    return make_optimizer(config.optimizer, config.train.steps, leaf_by_leaf=config.train.share_state)
 
 
 def group_of(axes: int) -> str:
@@ -73,9 +84,11 @@ def group_of(axes: int) -> str:
     return "undecayed" if axes == 1 else "decayed"
 
 
-def decays(vectors: dict[str, types.Array]) -> dict[str, bool]:
-    """Which of the vectors of `packed` weight decay applies to: optax's mask."""
-    return {name: name == "decayed" for name in vectors}
+def decays(params):
+    """Which leaves weight decay applies to, in a tree of parameters or in the vectors of `packed`: optax's mask."""
+    if isinstance(params, dict) and params.keys() <= {"decayed", "undecayed"}:
+        return {name: name == "decayed" for name in params}
+    return jax.tree.map(lambda leaf: group_of(leaf.ndim) == "decayed", params)
 
 
 def packed(inner: optax.GradientTransformation) -> optax.GradientTransformation:
@@ -95,9 +108,9 @@ def packed(inner: optax.GradientTransformation) -> optax.GradientTransformation:
     return optax.GradientTransformation(init, update)
 
 
-def norm(tree) -> types.Array:
-    """The global norm of a tree, which compiles as fast as an update."""
-    return optax.global_norm(_pack(tree))
+def norm(tree, *, leaf_by_leaf: bool = False) -> types.Array:
+    """The global norm of a tree; of packed vectors it compiles faster, leaf by leaf no share moves."""
+    return optax.global_norm(tree if leaf_by_leaf else _pack(tree))
 
 
 def _pack(tree) -> dict[str, types.Array]:

@@ -51,7 +51,7 @@ class Prepared:
 
     def with_variables(self, variables: types.Variables, config: config_lib.Config) -> state_lib.TrainState:
         """`state` with other variables of the same shapes and a fresh optimiser."""
-        optimizer = optimizer_lib.make_optimizer(config.optimizer, config.train.steps)
+        optimizer = optimizer_lib.of_config(config)
         state = state_lib.create(variables, optimizer, self.state.key, config.train.trainable)
         return parallel_lib.place_state(self.step.plan, state)
 
@@ -113,7 +113,7 @@ def plan(config: config_lib.Config, batch_shapes: types.Batch,
     """What `prepare` compiles, without weights; arguments and errors as there."""
     model = world_model.WorldModel(config.model)
     step = step_lib.make_train_step(model, config, frozen=frozen)
-    optimizer = optimizer_lib.make_optimizer(config.optimizer, config.train.steps)
+    optimizer = optimizer_lib.of_config(config)
     fresh = lambda variables: state_lib.create(variables, optimizer, jax.random.key(0), config.train.trainable)
     state = jax.eval_shape(fresh, model.variable_shapes())
     return Planned(step, parallel_lib.placed_state_shapes(step.plan, state),
@@ -138,7 +138,7 @@ def prepare(config: config_lib.Config, batch_shapes: types.Batch,
     run_key = jax.random.key(config.train.seed)
     example = jax.tree.map(lambda leaf: np.zeros((1, *leaf.shape[1:]), leaf.dtype), batch_shapes)
     variables = model.init(jax.random.fold_in(run_key, 0), example)
-    optimizer = optimizer_lib.make_optimizer(config.optimizer, config.train.steps)
+    optimizer = optimizer_lib.of_config(config)
     state = state_lib.create(variables, optimizer, jax.random.fold_in(run_key, 1), config.train.trainable)
     state = jax.block_until_ready(parallel_lib.place_state(step.plan, state))
     initialised_s = time.perf_counter()

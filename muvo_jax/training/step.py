@@ -8,6 +8,7 @@ one window are not one batch of 16 windows.
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -76,23 +77,27 @@ def make_train_step(model: world_model.WorldModel, config: config_lib.Config, *,
     """
     if config.augmentation.mirror:
         mirror.check(config.model)
-    optimizer = optimizer_lib.make_optimizer(config.optimizer, config.train.steps)
+    optimizer = optimizer_lib.of_config(config)
     rate = optimizer_lib.learning_rate(config.optimizer, config.train.steps)
+    norm = functools.partial(optimizer_lib.norm, leaf_by_leaf=config.train.share_state)
     gradients_of = gradient_body(model, config, frozen)
 
-    def body(state, batch, axis_name):
-        gradients, batch_stats, metrics = gradients_of(state, batch, axis_name)
-        trained, frozen_params = trainable.split(state.params, trainable.chosen(state.params, config.train.trainable))
-        gradient_norm = optimizer_lib.norm(gradients)
+    def split(params):
+        return trainable.split(params, trainable.chosen(params, config.train.trainable))
+
+    def update(state, found):
+        gradients, batch_stats, metrics = found
+        trained, frozen_params = split(state.params)
+        gradient_norm = norm(gradients)
         finite = jnp.isfinite(metrics["total"]) & jnp.isfinite(gradient_norm)
 
         def updated():
             updates, opt_state = optimizer.update(gradients, state.opt_state, trained)
-            norms = {"parameter_norm": optimizer_lib.norm(trained), "update_norm": optimizer_lib.norm(updates)}
+            norms = {"parameter_norm": norm(trained), "update_norm": norm(updates)}
             return (optax.apply_updates(trained, updates), batch_stats, opt_state), norms
 
         def kept():
-            return (trained, state.batch_stats, state.opt_state), {"parameter_norm": optimizer_lib.norm(trained),
+            return (trained, state.batch_stats, state.opt_state), {"parameter_norm": norm(trained),
                                                                    "update_norm": jnp.float32(0.0)}
 
         # A branch, because XLA does all in it after the gradients. Outside it copies the moments and packs the
@@ -103,8 +108,11 @@ def make_train_step(model: world_model.WorldModel, config: config_lib.Config, *,
         return state.replace(step=state.step + 1, params=trainable.merge(params, frozen_params),
                              batch_stats=batch_stats_after, opt_state=opt_state), metrics
 
-    plan = parallel_lib.make_plan(parallel or config.train.parallel, config.train.batch, devices)
-    return SpreadFunction(plan, config.optimizer.accumulate, parallel_lib.spread(plan, body, donate_state=True))
+    plan = parallel_lib.make_plan(parallel or config.train.parallel, config.train.batch, devices,
+                                  share_state=config.train.share_state)
+    spread = parallel_lib.spread(plan, gradients_of, then=update, shared=lambda state: split(state.params)[0],
+                                 donate_state=True)
+    return SpreadFunction(plan, config.optimizer.accumulate, spread)
 
 
 def make_validation_step(model: world_model.WorldModel, config: config_lib.Config, *, batch_size: int | None = None,
@@ -135,8 +143,8 @@ def gradient_body(model: world_model.WorldModel, config: config_lib.Config,
     """Returns body(state, batch [accumulate, b, ...], axis_name) -> (gradients, batch_stats, metrics).
 
     The gradients are a tree like the parameters, None where `config.train.trainable` freezes one. Gradients and
-    metrics are means over micro-batches, equal on all devices; running statistics pass through the micro-batches in
-    order.
+    metrics are means over micro-batches, equal on all devices (with `config.train.share_state` each device has its
+    share of the gradients); running statistics pass through the micro-batches in order.
     """
     def scored(trained, rest, *inputs, axis_name):
         return forward(trainable.merge(trained, rest), *inputs, model=model, config=config, train=True,
@@ -150,8 +158,7 @@ def gradient_body(model: world_model.WorldModel, config: config_lib.Config,
         with trainable.frozen_norms(trains):
             (_, (metrics, batch_stats)), gradients = differentiate(
                 *trainable.split(state.params, trains), batch_stats, batch, keys, axis_name=axis_name)
-        if axis_name is not None:
-            gradients = jax.lax.pmean(gradients, axis_name)
+        gradients = parallel_lib.mean_gradients(gradients, axis_name, config.train.share_state)
         return batch_stats, gradients, metrics
 
     def body(state, batch, axis_name):

@@ -16,7 +16,7 @@ import test_loop
 
 from muvo_jax import recordings, train
 from muvo_jax.model import world_model
-from muvo_jax.training import integrity, run_folder, validation
+from muvo_jax.training import integrity, parallel, run_folder, validation
 from muvo_jax.training import step as step_lib
 
 FLAGS = ("--preset=tiny", "--data=/memory", "--heads=image,action", "--frames=3", "--stride=1", "--context=2",
@@ -59,6 +59,7 @@ if __name__ == "__main__":
     world_model.WorldModel = test_loop.SmallWorld
     recordings.open_configured = lambda config, progress=None, split=None: Recording()
     train.draw_preview = train.draw_curves = lambda *_: None
+    parallel.LEAST_SHARED = 64  # of a small model's arrays
     step_lib.SpreadFunction.__call__ = dying(step_lib.SpreadFunction.__call__, "step")
     validation.Validator.run = dying(validation.Validator.run, "evaluation")
     integrity.seal = dying(integrity.seal, "save")

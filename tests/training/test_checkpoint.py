@@ -8,6 +8,7 @@ import pathlib
 import subprocess
 import sys
 import textwrap
+import threading
 import time
 
 import jax
@@ -58,6 +59,7 @@ def _save(folder, fresh, config, *steps, **options):
     for step in steps:
         keeper.save(step, _at(fresh, step), config=config, data_state={"position": step}, score=float(-step),
                     provenance={"name": "town"})
+    keeper.wait()
     return keeper
 
 
@@ -164,6 +166,7 @@ def test_keeps_the_last_and_the_best(tmp_path, fresh, config):
         if step == 3:  # the run goes on in another process
             keeper.close()
             keeper = checkpoint.Checkpoints(tmp_path, keep_last=2, keep_best=1)
+    keeper.wait()
     assert keeper.steps() == [2, 4, 5]
     keeper.close()
     assert checkpoint.load_run(tmp_path, "best").step == 2
@@ -239,6 +242,7 @@ def test_a_full_disk_leaves_the_checkpoint_before_and_says_so(tmp_path, fresh, c
         resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, 20_000))
         try:
             keeper.save(2, fresh, config=config)
+            keeper.wait()
         except checkpoint.CheckpointError as error:
             print(error)
         print(keeper.steps(), keeper.restore_latest(fresh, config).step)
@@ -256,9 +260,38 @@ def test_a_folder_that_cannot_be_written_is_told_and_what_is_there_stays(tmp_pat
         patch.setattr(integrity, "seal", lambda folder: (_ for _ in ()).throw(OSError(errno.EROFS, "Read-only")))
         with pytest.raises(checkpoint.CheckpointError, match=r"step 2 .* Read-only.*or the folder read-only\?.*: 1\."):
             keeper.save(2, _at(fresh, 2), config=config)
+            keeper.wait()
+    assert keeper.saved == 1
     assert keeper.restore_latest(fresh, config).step == 1
     keeper.save(2, _at(fresh, 2), config=config)
     assert keeper.restore_latest(fresh, config).step == 2
+
+
+def test_training_goes_on_while_a_checkpoint_is_written_and_the_one_before_stays_whole(tmp_path, fresh, config,
+                                                                                       monkeypatch):
+    keeper, slow, seal = _save(tmp_path, fresh, config, 1), threading.Event(), integrity.seal
+    monkeypatch.setattr(integrity, "seal", lambda folder: (slow.wait(60.0), seal(folder)))
+    state = _at(fresh, 2)
+    want = jax.tree.map(np.array, state.replace(key=jax.random.key_data(state.key)))
+    keeper.save(2, state, config=config)
+    for leaf in jax.tree.leaves(state.params):  # as the training step does with what was given to it
+        leaf.delete()
+    assert keeper.saved == 1 and checkpoint.load_run(tmp_path).step == 1
+    slow.set()
+    keeper.wait()
+    assert keeper.saved == 2
+    restored = keeper.restore_latest(fresh, config).state
+    jax.tree.map(np.testing.assert_array_equal, restored.replace(key=jax.random.key_data(restored.key)), want)
+
+
+def test_a_save_that_failed_in_the_background_is_told_at_the_next_look(tmp_path, fresh, config, monkeypatch):
+    keeper = _save(tmp_path, fresh, config, 1)
+    monkeypatch.setattr(integrity, "seal", lambda folder: (_ for _ in ()).throw(OSError(errno.ENOSPC, "No space")))
+    keeper.save(2, _at(fresh, 2), config=config)
+    with pytest.raises(checkpoint.CheckpointError, match=r"step 2 .*No space"):
+        for _ in range(600):
+            keeper.check()
+            time.sleep(0.1)
 
 
 def test_a_clock_that_was_set_back_changes_nothing(tmp_path, fresh, config, monkeypatch):
@@ -275,6 +308,7 @@ def test_a_clock_that_was_set_back_changes_nothing(tmp_path, fresh, config, monk
     keeper = checkpoint.Checkpoints(tmp_path)
     assert keeper.steps() == [1, 2, 3] and keeper.restore_latest(fresh, config).step == 3
     keeper.save(4, _at(fresh, 4), config=config)
+    keeper.wait()
     assert keeper.steps() == [1, 3, 4] and checkpoint.load_run(tmp_path).step == 4
 
 

@@ -88,7 +88,9 @@ def test_a_transformation_of_two_vectors_is_one_of_trees():
             update, states[index] = transformation.update(gradients, states[index], params)
             updates.append(update)
         chex.assert_trees_all_close(updates[1], updates[0], rtol=1e-6)
-        np.testing.assert_allclose(optimizer_lib.norm(gradients), optax.global_norm(gradients), rtol=1e-6)
+        for leaf_by_leaf in (False, True):
+            np.testing.assert_allclose(optimizer_lib.norm(gradients, leaf_by_leaf=leaf_by_leaf),
+                                       optax.global_norm(gradients), rtol=1e-6)
         params = optax.apply_updates(params, updates[1])
     assert params["frozen"] is None
     vectors = [leaf.shape for leaf in jax.tree.leaves(states[1]) if leaf.ndim]

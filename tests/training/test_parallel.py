@@ -16,6 +16,7 @@ import small_world
 
 from muvo_jax import config as config_lib
 from muvo_jax.model import rollout
+from muvo_jax.training import checkpoint
 from muvo_jax.training import optimizer as optimizer_lib
 from muvo_jax.training import parallel as parallel_lib
 from muvo_jax.training import state as state_lib
@@ -39,16 +40,20 @@ def setting(accumulate=1, heads=config_lib.HEADS):
     """Model, config, batch and a fresh state; fewer heads where a test is not about the losses (compiling is slow)."""
     config = small_world.make_config(accumulate, heads=heads)
     model, batch = CountedWorld(config.model), small_world.make_batch(config.model)
-    optimizer = optimizer_lib.make_optimizer(config.optimizer, config.train.steps)
-    return model, config, batch, state_lib.create(model.init(), optimizer, jax.random.key(1))
+    return model, config, batch, fresh(model, config)
+
+
+def fresh(model, config):
+    return state_lib.create(model.init(), optimizer_lib.of_config(config), jax.random.key(1))
 
 
 def gradients_under(mode, model, config, batch, state):
     """Gradients, running statistics and metrics of one step, as NumPy."""
     count = 1 if mode == "single" else config.train.batch
-    plan = parallel_lib.make_plan("auto" if mode == "single" else mode, config.train.batch, jax.devices()[:count])
+    plan = parallel_lib.make_plan("auto" if mode == "single" else mode, config.train.batch, jax.devices()[:count],
+                                  share_state=config.train.share_state)
     assert (plan.mode, len(plan.devices)) == (mode, count)
-    compiled = parallel_lib.spread(plan, step_lib.gradient_body(model, config))
+    compiled = parallel_lib.spread(plan, step_lib.gradient_body(model, config), shared=lambda state: state.params)
     placed = parallel_lib.place_batch(plan, batch, config.optimizer.accumulate)
     return jax.tree.map(np.asarray, compiled(parallel_lib.place_state(plan, state), placed))
 
@@ -76,6 +81,61 @@ def test_many_devices_give_the_gradients_of_one(mode):
 
 def test_accumulation_is_spread_alike():
     assert_same_gradients(gradients_under("shard_map", *setting(2, FEW)), gradients_of_one_device(2, FEW))
+
+
+@pytest.fixture
+def small_shares(monkeypatch):
+    """The arrays of a small model are shared too."""
+    monkeypatch.setattr(parallel_lib, "LEAST_SHARED", 64)
+
+
+@pytest.mark.usefixtures("small_shares")
+@pytest.mark.parametrize(("accumulate", "heads"), [(1, config_lib.HEADS), (2, FEW)])
+def test_devices_that_share_the_state_get_the_gradients_of_one(accumulate, heads):
+    model, config, batch, state = setting(accumulate, heads)
+    config = config_lib.override(config, "train.share_state", True)
+    assert_same_gradients(gradients_under("shard_map", model, config, batch, state),
+                          gradients_of_one_device(accumulate, heads))
+
+
+@pytest.mark.usefixtures("small_shares")
+def test_a_shared_state_is_in_parts_and_learns_what_one_device_learns():
+    model, config, _, _ = setting(heads=FEW)
+    count, shared = 4, config_lib.override(config, "train.share_state", True)
+    steps = {1: step_lib.make_train_step(model, config, devices=jax.devices()[:1]),
+             count: step_lib.make_train_step(model, shared, devices=jax.devices()[:count])}
+    assert steps[count].plan.describe().endswith("4 cpu devices, which share the state")
+    states = {1: fresh(model, config), count: fresh(model, shared)}
+    for seed in range(4):
+        losses = []
+        for devices, step in steps.items():
+            states[devices], metrics = step(states[devices], small_world.make_batch(model.config, seed=seed))
+            losses.append({name: float(value) for name, value in metrics.items()})
+        assert losses[1] == pytest.approx(losses[0], rel=1e-4)
+    large = lambda leaf: leaf.size >= parallel_lib.LEAST_SHARED and any(size % count == 0 for size in leaf.shape)
+    parts = [leaf.addressable_shards[0].data.size / leaf.size
+             for leaf in jax.tree.leaves((states[count].params, states[count].opt_state)) if large(leaf)]
+    assert len(parts) > 10 and set(parts) == {1 / count}
+
+
+@pytest.mark.usefixtures("small_shares")
+def test_a_shared_state_moves_to_other_devices_through_a_checkpoint(tmp_path):
+    model, config, batch, _ = setting(heads=FEW)
+    shared = config_lib.override(config, "train.share_state", True)
+    state, _ = step_lib.make_train_step(model, shared, devices=jax.devices()[:4])(fresh(model, shared), batch)
+    keeper = checkpoint.Checkpoints(tmp_path)
+    keeper.save(1, state, config=shared)
+    for devices in (1, 8):
+        other = step_lib.make_train_step(model, shared, devices=jax.devices()[:devices])
+        like = parallel_lib.place_state(other.plan, fresh(model, shared))
+        found = keeper.restore_latest(like, shared).state
+        for one, want, place in zip(*map(jax.tree.leaves, (found, state, like)), strict=True):
+            assert one.sharding == place.sharding
+            if not jax.dtypes.issubdtype(one.dtype, jax.dtypes.prng_key):
+                np.testing.assert_array_equal(one, want)
+    with pytest.raises(ValueError, match=r"share_state=True.*cannot go on with False.*--init"):
+        keeper.restore_latest(fresh(model, config), config)
+    keeper.close()
 
 
 def test_accumulation_averages_the_gradients_of_its_micro_batches():
@@ -162,6 +222,8 @@ def test_plans():
         parallel_lib.make_plan("pmap", 6, devices)
     with pytest.raises(ValueError, match="expected one of"):
         parallel_lib.make_plan("pjit", 4, devices)
+    with pytest.raises(ValueError, match="every device holds the state whole"):
+        parallel_lib.make_plan("pmap", 4, devices, share_state=True)
     with pytest.raises(ValueError, match="multiple of 6"):
         parallel_lib.place_batch(parallel_lib.make_plan("auto", 2, devices[:2]), setting()[2], 3)
 

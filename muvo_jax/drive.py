@@ -67,7 +67,7 @@ class Options:
     horizon: int = 10
     """Steps to plan ahead."""
     plans: int = 64
-    """Candidate plans of an iteration (icem, cem, mppi)."""
+    """Candidate plans of an iteration; gradient ascends from an eighth as many."""
     iterations: int = 3
     """Refinements of a plan."""
     futures: Literal["one", "each"] = "one"
@@ -193,8 +193,9 @@ def _planner(options, loaded, world, show):
 def planner_of(options: Options) -> tuple[str, planners.PlannerConfig]:
     """The planner's name in planners.PLANNERS and its settings; iCEM is CEM with kept elites and coloured noise."""
     elites = max(1, min(8, options.plans // 4))
-    improved = {"kept": min(3, elites)} if options.planner == "icem" else {"kept": 0, "noise_exponent": 0.0}
-    settings_ = planners.PlannerConfig(plans=options.plans, iterations=options.iterations, elites=elites, **improved)
+    own = {"icem": {"kept": min(3, elites)}, "gradient": {"kept": 0, "starts": max(1, options.plans // 8)}}
+    settings_ = planners.PlannerConfig(plans=options.plans, iterations=options.iterations, elites=elites,
+                                       **own.get(options.planner, {"kept": 0, "noise_exponent": 0.0}))
     return "cem" if options.planner == "icem" else options.planner, settings_
 
 

@@ -39,6 +39,7 @@ class PlannerConfig:
       std: first standard deviation of both action channels.
       smoothing: share of the old mean and deviation that stays.
       temperature: of MPPI's weights exp(return / temperature), in units of return.
+      starts: plans that gradient planning ascends from, the given one and others in coloured noise around it.
       learning_rate: of gradient planning (Adam).
     """
 
@@ -50,6 +51,7 @@ class PlannerConfig:
     std: Annotated[float, above(0)] = 0.5
     smoothing: Annotated[float, SHARE] = 0.1
     temperature: Annotated[float, above(0)] = 0.5
+    starts: Annotated[int, COUNT] = 8
     learning_rate: Annotated[float, above(0)] = 0.1
 
     def __post_init__(self):
@@ -111,25 +113,36 @@ def mppi(objective: Objective, key: Array, start: Array, config: PlannerConfig =
 
 
 def gradient(objective: Objective, key: Array, start: Array, config: PlannerConfig = PlannerConfig()) -> Plan:
-    """Gradient ascent on the return through the world model, projected to [-1, 1]; returns the best plan seen."""
-    start = _checked(start)
+    """Gradient ascent on the return through the world model, projected to [-1, 1]; returns the best plan seen.
+
+    It ascends from several plans at once: a return has flat parts and steps (a collision, a lost route), at whose far
+    side one slope does not arrive.
+    """
+    start = jnp.clip(_checked(start), -1.0, 1.0)
     optimizer = optax.adam(config.learning_rate)
-    value_and_gradient = jax.value_and_grad(lambda plan, key: objective(key, plan[None])[0])
+    key_starts, key = jax.random.split(key)
+    noise = coloured_noise(key_starts, (config.starts, *start.shape), config.noise_exponent)
+    plans = jnp.clip(start[None] + config.std * noise, -1.0, 1.0).at[0].set(start)
+
+    def total(plans, key):
+        values = objective(key, plans)
+        return values.sum(), values
+
+    def better(best, plans, values):
+        values = _finite(values)
+        index = values.argmax()
+        return jax.tree.map(lambda new, old: jnp.where(values[index] > best.value, new, old),
+                            Plan(plans[index], values[index]), best)
 
     def iterate(carry, key):
-        plan, state, best = carry
-        value, slope = value_and_gradient(plan, key)
-        better = value > best.value
-        best = Plan(jnp.where(better, plan, best.actions), jnp.where(better, value, best.value))
-        updates, state = optimizer.update(-jnp.nan_to_num(slope), state)
-        return (jnp.clip(optax.apply_updates(plan, updates), -1.0, 1.0), state, best), None
+        plans, state, best = carry
+        slopes, values = jax.grad(total, has_aux=True)(plans, key)
+        updates, state = optimizer.update(-jnp.nan_to_num(slopes), state)
+        return (jnp.clip(plans + updates, -1.0, 1.0), state, better(best, plans, values)), None
 
-    start = jnp.clip(start, -1.0, 1.0)
-    first = (start, optimizer.init(start), Plan(start, jnp.float32(-jnp.inf)))
-    (plan, _, best), _ = jax.lax.scan(iterate, first, jax.random.split(key, config.iterations))
-    value = objective(key, plan[None])[0]
-    better = value > best.value
-    return Plan(jnp.where(better, plan, best.actions), jnp.where(better, value, best.value))
+    first = (plans, optimizer.init(plans), Plan(start, jnp.float32(-jnp.inf)))
+    (plans, _, best), _ = jax.lax.scan(iterate, first, jax.random.split(key, config.iterations))
+    return better(best, plans, objective(key, plans))
 
 
 def _checked(start: Array) -> Array:

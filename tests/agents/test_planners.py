@@ -27,10 +27,21 @@ def test_a_planner_comes_near_the_best_plan(name):
     assert plan.value > -0.01 > objective(None, jnp.zeros((1, 6, 2)))[0]
 
 
-def test_a_plan_that_gives_nan_is_never_chosen():
+@pytest.mark.parametrize("name", ["cem", "gradient"])
+def test_a_plan_that_gives_nan_is_never_chosen(name):
     objective = lambda key, plans: jnp.where(plans[:, 0, 0] > 0, jnp.nan, plans[:, 0, 0])
-    plan = planners.cem(objective, jax.random.key(0), jnp.zeros((3, 2)))
+    plan = planners.PLANNERS[name](objective, jax.random.key(0), jnp.zeros((3, 2)))
     assert -0.2 < plan.value <= 0
+
+
+def test_gradient_ascent_leaves_a_hill_and_a_plateau_by_its_other_starts():
+    """A low hill at the start, nothing to climb beside it, and the high one at 0.8."""
+    height = lambda at, top, width: top * jnp.maximum(1.0 - jnp.abs(at) / width, 0.0)
+    objective = lambda key, plans: (height(plans, 0.2, 0.2) + height(plans - 0.8, 1.0, 0.5)).mean(axis=(1, 2))
+    ascend = lambda starts: planners.gradient(objective, jax.random.key(0), jnp.zeros((1, 2)), planners.PlannerConfig(
+        starts=starts, iterations=20, std=1.0))
+    assert ascend(1).value == pytest.approx(0.2, abs=0.02)
+    assert ascend(32).value > 0.8
 
 
 def test_in_imagination_the_fast_plan_is_found():

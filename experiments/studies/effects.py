@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -12,6 +12,7 @@ from scipy import stats
 from experiments.studies import tables
 
 CONFIRMED, CONTRADICTED, UNDECIDED = "confirmed", "contradicted", "undecided"
+TOO_SHORT = "too short to tell"
 
 
 def value(run: Mapping[str, Any] | None, split: str, metric: str) -> float:
@@ -51,6 +52,33 @@ def pairs_needed(differences: np.ndarray, says: str, margin: float) -> int | Non
     return None if not distance else max(2, math.ceil((2.0 * differences.std(ddof=1) / distance) ** 2))
 
 
+def lead(run: Mapping[str, Any], split: str, metric: str) -> float:
+    """How far a run is ahead of the training mean beyond the margin; infinite where that has no such score."""
+    metric = tables.OF_WHAT_IS_LEARNED[metric]
+    baseline = run["baselines"].get("training_mean", {}).get(split, {}).get(metric)
+    if baseline is None:
+        return math.inf
+    ahead = value(run, split, metric) - baseline["mean"]
+    return (-ahead if metric in tables.LOWER_IS_BETTER else ahead) - tables.MARGINS[metric]
+
+
+def updates_needed(runs: Sequence[Mapping[str, Any]], split: str, metric: str) -> int | None:
+    """At how many updates the mean of runs would lead by the margin, if each doubling brings what the last one did.
+
+    None where their curves do not say.
+    """
+    metric = tables.OF_WHAT_IS_LEARNED[metric]
+    sign, gains = (-1.0 if metric in tables.LOWER_IS_BETTER else 1.0), []
+    for run in runs:
+        curve = dict(map(tuple, run["curves"].get(split, {}).get(metric, [])))
+        last = max(curve, default=0)
+        if last // 2 in curve:
+            gains.append(sign * (curve[last] - curve[last // 2]))
+    gain, missing = np.mean(gains or [0.0]), -np.mean([lead(run, split, metric) for run in runs])
+    doublings = missing / gain if gain > 0.0 else math.inf
+    return None if doublings > 10.0 else int(round(runs[0]["steps"] * 2.0**doublings, -2))
+
+
 def of_claims(study: tables.Study, runs: Mapping[str, Mapping[str, Any]], suffix: str = "") -> list[dict[str, Any]]:
     """A row for each claim, metric and split.
 
@@ -59,8 +87,9 @@ def of_claims(study: tables.Study, runs: Mapping[str, Mapping[str, Any]], suffix
       suffix: of the labels, "+memory" for the runs with memory.
 
     Returns:
-      rows {"claim", "metric", "split", "pairs", "effect", "interval", "verdict", "pairs_needed"}; the effect is
-      positive where the claim's first arm is better.
+      rows {"claim", "metric", "split", "pairs", "effect", "interval", "verdict", "pairs_needed", "updates_needed"}; the
+      effect is positive where the claim's first arm is better. Where no run without memory that is compared is ahead of
+      the training mean by the margin, the verdict is TOO_SHORT, and updates_needed says how many might do.
     """
     rows = []
     for claim in study.claims:
@@ -72,9 +101,15 @@ def of_claims(study: tables.Study, runs: Mapping[str, Mapping[str, Any]], suffix
                 signed = np.array([item for item in found if not math.isnan(item)])
                 signed = -signed if metric in tables.LOWER_IS_BETTER else signed
                 mean, low, high = mean_and_interval(signed)
-                margin = tables.MARGINS[metric]
+                margin, said, updates = tables.MARGINS[metric], UNDECIDED, None
+                compared = [run for pair in claim.pairs for label in pair
+                            for run in runs.get(label + suffix, {}).values()]
+                if not suffix and compared and not any(lead(run, split, metric) > 0.0 for run in compared):
+                    said, updates = TOO_SHORT, updates_needed(compared, split, metric)
+                else:
+                    said = verdict(low, high, claim.says, margin)
                 rows.append({"claim": claim.text, "metric": metric, "split": split, "pairs": len(signed),
-                             "effect": mean, "interval": [low, high], "verdict": verdict(low, high, claim.says, margin),
+                             "effect": mean, "interval": [low, high], "verdict": said, "updates_needed": updates,
                              "pairs_needed": pairs_needed(signed, claim.says, margin)})
     return [row for row in rows if row["pairs"]] + (_order(study, runs, suffix) if study.order_kept else [])
 
@@ -96,7 +131,7 @@ def _order(study: tables.Study, runs: Mapping[str, Mapping[str, Any]], suffix: s
             ("another domain keeps the order of the arms (Spearman correlation)", len(means), float(rank.statistic),
              limits, verdict(*limits, "better", 0.0))]
     return [{"claim": claim, "metric": metric, "split": f"{known} to {other}", "pairs": count, "effect": effect,
-             "interval": interval, "verdict": said, "pairs_needed": None}
+             "interval": interval, "verdict": said, "pairs_needed": None, "updates_needed": None}
             for claim, count, effect, interval, said in rows]
 
 

@@ -112,7 +112,11 @@ def make(study: tables.Study, scale: str, job: Job, folder: pathlib.Path, say: C
         arguments = ([f"--name={job.name}", f"--runs-dir={folder}", "--resume"] if resumed
                      else flags(study, scale, job, folder, extra))
         say(f"{job.name}: {'resumed' if resumed else 'started'}" + (" again" if attempt else ""))
-        code, used_s = _run(["muvo_jax.train", *arguments], folder / f"{job.name}.{LOG}")
+        code, used_s = _run(["muvo_jax.train", *arguments, "--no-evaluate"], folder / f"{job.name}.{LOG}")
+        if code == 0 and not (run / EVALUATION).is_file() and _trained(run):  # the splits that are compared, and no dream
+            code, judging_s = _run(["muvo_jax.evaluate", str(run), "--splits", *tables.SPLITS],
+                                   folder / f"{job.name}.{LOG}")
+            used_s += judging_s
         if run.is_dir():
             cost = json.loads((run / COST).read_text(encoding="utf-8")) if (run / COST).is_file() else {}
             total_s = cost.get("processor_s", 0.0) + used_s
@@ -126,6 +130,12 @@ def make(study: tables.Study, scale: str, job: Job, folder: pathlib.Path, say: C
     (folder / f"{job.name}.{LOG}").replace(run / LOG)
     (run / DIED).write_text(f"died {ATTEMPTS} times, last with code {code}\n", encoding="utf-8")
     return False
+
+
+def _trained(run: pathlib.Path) -> bool:
+    """Whether a run has reached its last step."""
+    steps = json.loads((run / "config.json").read_text(encoding="utf-8"))["train"]["steps"]
+    return (run / "checkpoints" / str(steps)).is_dir()
 
 
 def _run(command: Sequence[str], log: pathlib.Path) -> tuple[int, float]:

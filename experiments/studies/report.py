@@ -56,9 +56,13 @@ def claims(rows: Sequence[Mapping[str, Any]]) -> Table:
     """The verdicts as a table."""
     head = ["the paper says", "by", "split", "pairs", "effect", "95 %", "verdict"]
     def told(row):
-        needed = row["pairs_needed"]
-        wait = row["verdict"] == effects.UNDECIDED and needed
-        return row["verdict"] + (f"; about {needed} pairs would tell" if wait else "")
+        needed, updates = row["pairs_needed"], row["updates_needed"]
+        if row["verdict"] == effects.UNDECIDED and needed:
+            return f"{row['verdict']}; about {needed} pairs would tell"
+        if row["verdict"] == effects.TOO_SHORT:
+            how_long = f"some {updates} updates might do" if updates else "the curves do not say how long would do"
+            return f"{row['verdict']}: no arm is ahead of the training mean; {how_long}"
+        return row["verdict"]
     return head, [[row["claim"], tables.NAMES[row["metric"]], row["split"], str(row["pairs"]),
                    f"{row['effect']:+.3f}", _interval(row["interval"], "+.3f"), told(row)] for row in rows]
 

@@ -113,7 +113,7 @@ def make(study: tables.Study, scale: str, job: Job, folder: pathlib.Path, say: C
                      else flags(study, scale, job, folder, extra))
         say(f"{job.name}: {'resumed' if resumed else 'started'}" + (" again" if attempt else ""))
         code, used_s = _run(["muvo_jax.train", *arguments, "--no-evaluate"], folder / f"{job.name}.{LOG}")
-        if code == 0 and not (run / EVALUATION).is_file() and _trained(run):  # the splits that are compared, and no dream
+        if code == 0 and not (run / EVALUATION).is_file() and _trained(run):  # on what is compared, and no dream
             code, judging_s = _run(["muvo_jax.evaluate", str(run), "--splits", *tables.SPLITS],
                                    folder / f"{job.name}.{LOG}")
             used_s += judging_s

@@ -119,9 +119,10 @@ def gradient(objective: Objective, key: Array, start: Array, config: PlannerConf
     side one slope does not arrive.
     """
     start = jnp.clip(_checked(start), -1.0, 1.0)
+    horizon, channels = start.shape
     optimizer = optax.adam(config.learning_rate)
     key_starts, key = jax.random.split(key)
-    noise = coloured_noise(key_starts, (config.starts, *start.shape), config.noise_exponent)
+    noise = coloured_noise(key_starts, (config.starts, horizon, channels), config.noise_exponent)
     plans = jnp.clip(start[None] + config.std * noise, -1.0, 1.0).at[0].set(start)
 
     def total(plans, key):

@@ -70,7 +70,7 @@ def updates_needed(runs: Sequence[Mapping[str, Any]], split: str, metric: str) -
     metric = tables.OF_WHAT_IS_LEARNED[metric]
     sign, gains = (-1.0 if metric in tables.LOWER_IS_BETTER else 1.0), []
     for run in runs:
-        curve = dict(map(tuple, run["curves"].get(split, {}).get(metric, [])))
+        curve = {step: at for step, at in run["curves"].get(split, {}).get(metric, []) if at is not None}
         last = max(curve, default=0)
         if last // 2 in curve:
             gains.append(sign * (curve[last] - curve[last // 2]))

@@ -129,12 +129,18 @@ def train(job: Job, show: screen.Screen) -> Outcome:
         run_folder.write_config(job.folder, config)
         files = run_folder.RunFolder(job.folder, done)
         validator = validation.Validator(ready.model, config, frames, job.frozen)
+        run = _Run(job, show, config, ready, keeper, files, validator, state, done, origin)
         try:
-            return _Run(job, show, config, ready, keeper, files, validator, state, done, origin).loop(source, making_s)
+            outcome = run.loop(source, making_s)
+            keeper.close()
+            return outcome
+        except BaseException:
+            if jax.process_count() == 1:  # else a save under way might wait for a host that is lost
+                keeper.close()
+            raise
         finally:
             show.stop()
             files.close()
-            keeper.close()
 
 
 def windows_per_step(config: config_lib.Config) -> int:

@@ -1,7 +1,5 @@
 """Recordings of other people's kinds: what is found, what is refused by name; what a run lacks takes nothing away."""
 
-import re
-import shutil
 import warnings
 
 import numpy as np
@@ -263,80 +261,6 @@ def test_a_column_that_one_run_lacks_is_not_switched_off_for_the_others(tmp_path
     assert (batch.reward is None) == (column == "reward") and batch.is_terminal is not None
 
 
-@pytest.mark.parametrize(("changes", "message"), [
-    ({"rate_hz": "0"}, "rate_hz is 0.0; it must be above 0"),
-    ({"rate_hz": "nan"}, "rate_hz is nan"),
-    ({"rate_hz": "true"}, "rate_hz is True, expected a number"),
-    ({"splits": '["train", "train"]'}, "splits is .*expected a list of different names"),
-    ({"splits": "[1]"}, "splits is .*expected a list of different names"),
-    ({"width_px": "0"}, "camera.width_px is 0; it must be at least 1"),
-    ({"width_px": "true"}, "camera.width_px: got True, expected int"),
-    ({"height_px": '"32"'}, "camera.height_px: got '32', expected int"),
-    ({"intrinsics": "[[nan, 0, 32], [0, 32, 16], [0, 0, 1]]"}, "camera.intrinsics is .*it must be finite"),
-    ({"intrinsics": "[[0, 0, 32], [0, 32, 16], [0, 0, 1]]"}, "camera.intrinsics have fx = 0 for 64 pixels"),
-    ({"intrinsics": "[[0.5, 0, 0.5], [0, 0.5, 0.5], [0, 0, 1]]"}, "camera.intrinsics have fx = 0.5 for 64 pixels"),
-    ({"intrinsics": "[[32, 0, 32000], [0, 32, 16], [0, 0, 1]]"}, "camera.intrinsics have cx = 32000"),
-    ({"intrinsics": "[[32, 0, 32], [0, 32, 16], [0, 0, 0]]"}, r"camera.intrinsics are .*\[0, 0, 1\]\] in pixels"),
-    ({"camera_to_ego": "[[0, 0, 2, 1], [-1, 0, 0, 0], [0, -1, 0, 2], [0, 0, 0, 1]]"}, "camera_to_ego is .*a rotation"),
-    ({"camera_to_ego": "[[0, 0, 1, 1500], [-1, 0, 0, 0], [0, -1, 0, 1600], [0, 0, 0, 1]]"},
-     r"camera_to_ego puts the camera at \[1500.0, 0.0, 1600.0\]; each coordinate must be .* m"),
-    ({"camera_to_ego": "[[0, 0, 1, 1], [1, 0, 0, 0], [0, -1, 0, 2], [0, 0, 0, 1]]"}, "camera_to_ego is .*a rotation"),
-    ({"elevation_min_rad": "-25.0"}, "lidar.elevation_min_rad is -25.0; it must be .* rad"),
-    ({"elevation_min_rad": "0.4"}, "lidar.elevation_min_rad is 0.4; it must be below elevation_max_rad, 0.1"),
-    ({"rows": "0"}, "lidar.rows is 0"),
-    ({"rows": "64.5"}, "lidar.rows: got 64.5, expected int"),
-    ({"position_m": "[0.5, 0, 2000]"}, r"lidar.position_m is .*; it must be at least -30 and at most 30 m"),
-    ({"voxel_size_m": "-1"}, "voxels.voxel_size_m is -1.0; it must be above 0"),
-    ({"shape": "[16, 0, 16]"}, "voxels.shape is .*at least 1"),
-    ({"accel_full_mps2": "0"}, "action.accel_full_mps2 is 0.0; it must be above 0"),
-    ({"source": '"measured"'}, "action.source: 'measured' is unknown"),
-])
-def test_descriptions_that_cannot_be_are_refused_by_name(tmp_path, changes, message):
-    with pytest.raises(schema.DataError, match=f"recording.toml.*{message}"):
-        plain_reader.PlainRecording(writers.write_plain(tmp_path, {"train/a": 2}, **changes))
-
-
-def spoil(old, new):
-    def change(root):
-        for table in root.glob("*/*/frames.csv"):
-            assert old in table.read_text()
-            table.write_text(table.read_text().replace(old, new))
-    return change
-
-
-def rename_folder(old, new):
-    return lambda root: (root / old).rename(root / new)
-
-
-@pytest.mark.parametrize(("change", "header", "message"), [
-    (spoil("\n1,0.1,", "\n1_0,0.1,"), {}, "line 3: frame_id is '1_0', expected a whole number"),
-    (spoil("\n1,0.1,", "\n\u0661,0.1,"), {}, "line 3: frame_id is '\u0661', expected a whole number"),
-    (spoil("5.5", "5_5.0"), {}, "line 2: speed_mps is '5_5.0', expected a finite number"),
-    (rename_folder("train/a/image", "train/a/Image"), {}, "train/a/Image: expected the name image. Rename"),
-    (rename_folder("train", "Train"), {}, "Train: expected the name train, as recording.toml says. Rename"),
-    (rename_folder("train/a/lidar", "train/a/LIDAR"), {}, "train/a/LIDAR: expected the name lidar. Rename"),
-    (lambda root: None, {"splits": '["train", "../other"]'}, "splits has '../other', expected names of folders"),
-    (lambda root: None, {"splits": '["train", "/etc"]'}, "splits has '/etc', expected names of folders"),
-    (lambda root: None, {"splits": '["train", ".."]'}, "splits has '..', expected names of folders"),
-])
-def test_names_and_numbers_that_only_python_or_one_system_takes_are_refused(tmp_path, change, header, message):
-    root = writers.write_plain(tmp_path, {"train/a": 2}, **header)
-    change(root)
-    with pytest.raises(schema.DataError, match=re.escape(message)):
-        sources.open_recording(root)
-
-
-def test_a_kitti_folder_in_another_case_and_an_array_that_calls_itself_an_archive_are_named(tmp_path):
-    drive = writers.write_kitti(tmp_path / "kitti", 3)
-    (drive / "image_02").rename(drive / "Image_02")
-    with pytest.raises(schema.DataError, match=r"Image_02: expected the name image_02\. Rename the folder"):
-        sources.open_recording(drive)
-    with (tmp_path / "0.npz").open("wb") as file:
-        np.save(file, np.zeros((5, 3), np.float32))
-    with pytest.raises(schema.DataError, match=r"0.npz: a single array \(NPY\) under the name of an NPZ file"):
-        files.read_npz(tmp_path / "0.npz", "points_m")
-
-
 @pytest.mark.parametrize("is_packed", [False, True])
 def test_no_more_of_a_frame_is_read_than_a_batch_needs(tmp_path, is_packed):
     root = writers.write_plain(tmp_path / "plain", {"train/a": 8, "val_rl/b": 8})
@@ -367,35 +291,6 @@ def test_no_more_of_a_frame_is_read_than_a_batch_needs(tmp_path, is_packed):
         assert set(read) & with_files == opened
 
 
-def test_one_rate_is_said_once(tmp_path):
-    root = writers.write_plain(tmp_path, {"train/a": 30}, rate_hz="20")
-    assert plain_reader.PlainRecording(root).description.contract.rate_hz == 20.0  # the section does not say one
-    path = root / "recording.toml"
-    path.write_text(path.read_text().replace("[action]\n", "[action]\nrate_hz = 10.0\n"))
-    with pytest.raises(schema.DataError, match=r"rate_hz is 20, but action.rate_hz is 10: a step would last two times"):
-        plain_reader.PlainRecording(root)
-
-
-def test_a_description_with_a_byte_order_mark_and_one_with_a_slip(tmp_path):
-    root = writers.write_plain(tmp_path, {"train/a": 2})
-    path = root / "recording.toml"
-    text = path.read_text()
-    path.write_text("\ufeff" + text, encoding="utf-8")
-    assert plain_reader.PlainRecording(root).description.name == "test"
-    path.write_text(text.replace("[voxels]", "[voxel]"))
-    with pytest.raises(schema.DataError, match=r"'voxel' is unknown. Did you mean voxels\?"):
-        plain_reader.PlainRecording(root)
-
-
-def test_route_maps_have_the_scale_that_the_recording_says(tmp_path):
-    root = writers.write_plain(tmp_path, {"train/a": 30, "val_rl/b": 30})
-    assert plain_reader.PlainRecording(root).description.route_map == config_lib.RouteMap()
-    with (root / "recording.toml").open("a") as file:
-        file.write("[route_map]\nmetres_per_px = 0.5\nego_row = 60\n")
-    config = fitting.adapt(presets.tiny(), plain_reader.PlainRecording(root)).config
-    assert config.data.route_map == config_lib.RouteMap(0.5, 60.0, 32.0)
-
-
 def test_the_writer_refuses_slips_and_numbers_that_cannot_be(tmp_path):
     frame = {"frame_id": 0, "timestamp_s": 0.0, "speed_mps": 1.0, "acceleration": 0.0, "steering": 0.0}
     writer = plain_writer.RunWriter(tmp_path, "train", "a")
@@ -418,59 +313,6 @@ def test_home_folders_are_expanded(tmp_path, monkeypatch):
     assert kitti_reader.KittiRecording(f"~/kitti/{drive.parent.name}").sequences
     plain_writer.RunWriter("~/mine", "train", "a").close()
     assert plain_writer.is_complete("~/mine", "train", "a") and (tmp_path / "mine/train/a/frames.csv").is_file()
-
-
-def kitti_bytes(drive, name, change):
-    path = drive / name
-    path.write_bytes(change(path.read_bytes()))
-
-
-@pytest.mark.parametrize("name", [lambda k: f"{k:010d}.jpg", lambda k: f"{k:010d}.JPG", lambda k: f"{k:06d}.png"])
-def test_kitti_pictures_may_be_jpeg_upper_case_or_padded_otherwise(tmp_path, name):
-    drive = writers.write_kitti(tmp_path)
-    for path in sorted((drive / "image_02/data").iterdir()):
-        target = path.with_name(name(int(path.stem)))
-        image = Image.open(path)
-        image.load()
-        path.unlink()
-        image.save(target, quality=95) if target.suffix.lower() == ".jpg" else image.save(target)
-    recording = sources.open_recording(drive)
-    assert recording.description.camera is not None
-    assert np.abs(recording.read(recording.sequences[0], 3)["image"].astype(int) - 30).max() <= 2
-
-
-@pytest.mark.parametrize(("name", "change", "message"), [
-    ("oxts/data/0000000000.txt", lambda c: b"\xef\xbb\xbf" + c, None),
-    ("oxts/data/0000000000.txt", lambda c: c.replace(b"10.0", b"1000.0", 1), r"forward speed \(number 9\) is 1000"),
-    ("oxts/data/0000000000.txt", lambda c: b"91 " + c.split(b" ", 1)[1], r"latitude .* is 91; .* degrees"),
-    ("velodyne_points/data/0000000000.bin", lambda c: (np.frombuffer(c, np.float32) * 100).tobytes(),
-     r"reflectance lies between 0 and 1"),
-    ("velodyne_points/data/0000000000.bin", lambda c: (np.frombuffer(c, np.float32).reshape(-1, 4)
-                                                        * np.float32([1e6, 1e6, 1e6, 1])).tobytes(), "points_m has"),
-    ("../calib_cam_to_cam.txt", lambda c: c.replace(b"P_rect_02: 70.0", b"P_rect_02: 0.0"), "make no camera"),
-    ("../calib_velo_to_cam.txt", lambda c: c.replace(b"T: 0 -0.08 -0.3", b"T: 0 -80 -300"), "make no camera: .*puts"),
-])
-def test_kitti_numbers_that_cannot_be_are_refused(tmp_path, name, change, message):
-    drive = writers.write_kitti(tmp_path)
-    kitti_bytes(drive, name, change)
-    if message is None:
-        recording = kitti_reader.KittiRecording(drive)
-        assert recording.read(recording.sequences[0], 0)["speed_mps"] == 10.0
-        return
-    with pytest.raises(schema.DataError, match=message):
-        recording = kitti_reader.KittiRecording(drive)
-        recording.read(recording.sequences[0], 0)
-
-
-def test_one_drive_with_more_takes_no_drive_away(tmp_path):
-    drive = writers.write_kitti(tmp_path)
-    for number in (100, 101):
-        other = drive.with_name(f"2011_09_26_drive_0{number}_sync")
-        shutil.copytree(drive, other)
-        shutil.rmtree(other / "velodyne_points")
-    with pytest.warns(schema.DataWarning, match="only 1 of 3 drives have velodyne_points: it is not used"):
-        recording = kitti_reader.KittiRecording(tmp_path)
-    assert len({sequence.name for sequence in recording.sequences}) == 3 and recording.description.lidar is None
 
 
 def test_frames_without_what_the_model_needs_are_refused_by_name(tmp_path):

@@ -285,11 +285,10 @@ def test_a_missing_library_names_its_extra():
         optional.need("a_library_that_does_not_exist", "gymnax")
 
 
-# Last on purpose, for a reason not understood: run before test_stoa_wrappers_..., [stoa] makes that test fail with
-# "Execution supplied 10 arguments but compiled program expected 31" (JAX 0.10.2). Scripts with the same calls do not.
 @pytest.mark.parametrize("name", DOORS)
 def test_decoded_sensors_come_by_head_and_no_state_holds_or_gathers_memory(name):
     """Of a model that remembers what was seen; nothing is computed, shapes are all."""
+    pytest.importorskip(name)  # not first inside a trace: stoa makes arrays when it is imported
     model, starts, _ = with_memory(heads=("image", "range_view", "action"))
     core = environment_lib.Environment(model, periods=2, reward_config=NO_COLLISION,
                                        observation=("image", "range_view"))
@@ -310,3 +309,10 @@ def test_decoded_sensors_come_by_head_and_no_state_holds_or_gathers_memory(name)
     assert numbers(starts.memory) > 10 * (latent + 40)
     # the latent, the car, key and terms, and in brax's state the observation; no weights, memory or bank
     assert numbers(first) <= latent + 40 + (numbers(observation) if name == "brax" else 0)
+
+
+def test_a_library_that_is_first_imported_inside_a_trace_leaves_nothing_of_it(tmp_path, monkeypatch):
+    (tmp_path / "makes_arrays.py").write_text("import jax.numpy as jnp\nONE = jnp.array(1, jnp.int8)\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    assert jax.jit(lambda: optional.need("makes_arrays", "x").ONE + 1)() == 2
+    assert int(optional.need("makes_arrays", "x").ONE) == 1

@@ -5,15 +5,21 @@ from __future__ import annotations
 import importlib
 from typing import Any
 
+import jax
+
 
 def need(module: str, extra: str) -> Any:
     """Imports `module`.
+
+    A door may be opened for the first time inside jit: arrays that a library makes of itself when it is imported (stoa's
+    kinds of steps) must not belong to that trace.
 
     Raises:
       ImportError: naming the extra of muvo_jax that brings it.
     """
     try:
-        return importlib.import_module(module)
+        with jax.ensure_compile_time_eval():
+            return importlib.import_module(module)
     except ImportError as error:
         raise ImportError(f"{module} cannot be imported ({error}); this door needs the extra [{extra}]: "
                           f"pip install 'muvo_jax[{extra}]'") from error

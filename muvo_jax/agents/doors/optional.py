@@ -11,8 +11,8 @@ import jax
 def need(module: str, extra: str) -> Any:
     """Imports `module`.
 
-    A door may be opened for the first time inside jit: arrays that a library makes of itself when it is imported (stoa's
-    kinds of steps) must not belong to that trace.
+    A door may be opened for the first time inside jit: arrays that a library makes when it is imported (stoa's kinds of
+    steps) must not belong to that trace.
 
     Raises:
       ImportError: naming the extra of muvo_jax that brings it.

@@ -81,7 +81,11 @@ class Plan:
 
     def state_shardings(self, state: Any) -> Any:
         """`state_specs` on this plan's mesh."""
-        return jax.tree.map(lambda spec: NamedSharding(self.mesh, spec), self.state_specs(state))
+        mesh = self.mesh
+        if not self.share_state:
+            whole = NamedSharding(mesh, PartitionSpec())
+            return jax.tree.map(lambda _: whole, state)
+        return jax.tree.map(lambda spec: NamedSharding(mesh, spec), self.state_specs(state))
 
 
 def shared_axis(shape: Sequence[int], devices: int) -> int | None:
@@ -147,6 +151,9 @@ def place_state(plan: Plan, state: Any) -> Any:
     Several processes must all pass the same numbers.
     """
     shardings = plan.state_shardings(state)
+    pairs = zip(jax.tree.leaves(state), jax.tree.leaves(shardings), strict=True)
+    if all(isinstance(leaf, jax.Array) and leaf.sharding == sharding for leaf, sharding in pairs):
+        return state  # device_put looks at the leaves one by one, in every step
     if plan.processes == 1:
         return jax.device_put(state, shardings)
     return jax.tree.map(_on_all_processes, state, shardings)

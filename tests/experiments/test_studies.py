@@ -162,9 +162,11 @@ def test_a_claim_of_arms_that_learned_nothing_is_too_short_to_tell_and_how_long_
 def test_the_report_is_one_page_with_its_pictures(tmp_path):
     results = {"runs": {"RV-WOB-TR": {"0": _run_of(20.0), "1": _run_of(21.0)}, "PP-WOB-TR": {"0": _run_of(19.0),
                "1": None}}, "command": "c", "commit": "d", "code": "e", "machine": "m"}
+    results["runs"]["PP-WOB-TR"]["0"]["baselines"]["warp_last"] = {"val_rl": {tables.CHAMFER: {"mean": 0.74}}}
     report.write(tmp_path, tables.FUSION, results)
     text, page = (tmp_path / report.REPORT).read_text(), (tmp_path / report.PAGE).read_text()
     assert "| RV-WOB-TR | 2 | 20.500 (20.000..21.000) |" in text
+    assert "| training mean |  | 10.000 |  |" in text and "| warp-last |  |  | 0.740 |" in text  # of any run
     assert "Not complete yet: 1 of the planned runs" in text
     assert 'src="data:image/png;base64,' in page and "http" not in page
     assert json.loads((tmp_path / report.RESULTS).read_text()) == results

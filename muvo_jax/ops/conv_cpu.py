@@ -5,7 +5,7 @@ a convolution whose window is the whole image, and 3D convolutions with few chan
 need be. Here the kernel gradient is one matrix product per kernel tap, accumulated over chunks that stay in the cache
 (or XLA's own, where a large batch of narrow images makes that one fast); the input gradient is an ordinary convolution
 with the flipped kernel; and a 3D convolution folds blocks of voxels along its last axis into channels, so that a banded
-kernel and a 2D convolution do the work.
+kernel and a 2D convolution do the work. A layer of a few pixels and many channels is one matrix product.
 
 `muvo_jax.ops.conv` is the public face; nothing here checks its arguments. Reverse-mode differentiation only.
 """
@@ -26,6 +26,10 @@ Pairs = tuple[tuple[int, int], ...]
 
 _CHUNK_BYTES = 1 << 20  # what one pass over the kernel taps reads: half of a core's second-level cache
 _LITTLE_WORK = 5e8  # floating-point operations of a kernel gradient below which XLA's own one is at least as fast
+# A layer of so few pixels a sample and so many weights a tap is faster as a matrix product: 40 times at one pixel of
+# 512 channels; at 64 pixels of 128 channels it no longer is.
+_FEW_PIXELS = 8
+_MANY_WEIGHTS = 1 << 14
 _FOLDED_WIDTH = 16  # output channels of a folded block below which the matrix product starves
 
 
@@ -48,6 +52,8 @@ def dense(x, kernel, padding: Pairs):
     """Stride-1 convolution in two or three dimensions: x [N, *S, C], kernel [*K, C, O] -> [N, *S', O]."""
     if kernel.ndim == 5:
         return _folded(x, kernel, padding)
+    if _is_small(x, kernel, (1, 1), padding):
+        return _of_patches(x, kernel, (1, 1), padding)
     return _dense_2d(x, kernel, padding, (1, 1))
 
 
@@ -55,7 +61,37 @@ def strided(x, kernel, stride: tuple[int, ...], padding: Pairs):
     """Convolution with a stride, in two or three dimensions."""
     if kernel.ndim == 5:
         return _strided_by_phases(x, kernel, stride, padding)
+    if _is_small(x, kernel, stride, padding):
+        return _of_patches(x, kernel, stride, padding)
     return _strided_2d(x, kernel, stride, padding)
+
+
+def _outputs(x, kernel, stride: tuple[int, ...], padding: Pairs) -> list[int]:
+    """The spatial sizes of what a convolution returns."""
+    return [(n + low + high - taps) // step + 1 for n, (low, high), taps, step in zip(
+        x.shape[1:-1], padding, kernel.shape[:-2], stride, strict=True)]
+
+
+def _is_small(x, kernel, stride: tuple[int, ...], padding: Pairs) -> bool:
+    few = math.prod(_outputs(x, kernel, stride, padding)) <= _FEW_PIXELS
+    return few and math.prod(kernel.shape[-2:]) >= _MANY_WEIGHTS
+
+
+def _of_patches(x, kernel, stride: tuple[int, ...], padding: Pairs):
+    """A 2D convolution as one product of all outputs' patches with the taps that see more than padding."""
+    outs = _outputs(x, kernel, stride, padding)
+    used = []
+    for n, taps, out, step, (low, _) in zip(x.shape[1:-1], kernel.shape[:2], outs, stride, padding, strict=True):
+        seen = [tap for tap in range(taps) if any(0 <= place * step + tap - low < n for place in range(out))]
+        used.append(range(min(seen, default=0), max(seen, default=0) + 1))
+    x = lax.pad(x, jnp.zeros((), x.dtype), ((0, 0, 0), *((low, high, 0) for low, high in padding), (0, 0, 0)))
+    cut = lambda row, column: lax.slice(
+        x, (0, row, column, 0), (x.shape[0], row + (outs[0] - 1) * stride[0] + 1,
+                                 column + (outs[1] - 1) * stride[1] + 1, x.shape[-1]), (1, *stride, 1))
+    patches = jnp.concatenate([cut(row, column) for row in used[0] for column in used[1]], axis=-1)
+    rows, columns = (slice(taps.start, taps.stop) for taps in used)
+    taps = kernel[rows, columns].reshape(patches.shape[-1], kernel.shape[-1])
+    return jnp.einsum("nhwi,io->nhwo", patches, taps, precision=precision.PRODUCTS)
 
 
 @functools.partial(jax.custom_vjp, nondiff_argnums=(2, 3))
@@ -222,7 +258,7 @@ def _strided_by_phases(x, kernel, stride: tuple[int, ...], padding: Pairs):
     rank = len(taps)
     sizes = x.shape[1:-1]
     blocks = [-(-k // s) for k, s in zip(taps, stride, strict=True)]
-    outs = [(n + low + high - k) // s + 1 for n, (low, high), k, s in zip(sizes, padding, taps, stride, strict=True)]
+    outs = _outputs(x, kernel, stride, padding)
     # Rows and columns that no output reads are cut off by the negative padding.
     edges = [(low, (o + b - 1) * s - n - low, 0)
              for n, (low, _), o, b, s in zip(sizes, padding, outs, blocks, stride, strict=True)]

@@ -102,6 +102,18 @@ def test_conv_is_its_definition_and_differentiates_like_xla(problem):
 
 
 @PROPERTY
+@given(problems(transposed=False))
+def test_a_layer_of_few_pixels_and_many_channels_is_its_definition_too(problem):
+    x_shape, kernel_shape, options = problem
+    x, kernel = normal(0, x_shape, kernel_shape)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(conv_cpu, "_FEW_PIXELS", 1000)
+        patch.setattr(conv_cpu, "_MANY_WEIGHTS", 0)
+        got = assert_same_function(functools.partial(conv_ops.conv, **options), x, kernel)
+    assert_near(got, conv_by_definition(np.asarray(x), np.asarray(kernel), **options))
+
+
+@PROPERTY
 @given(problems(transposed=True))
 def test_conv_transpose_is_its_definition_and_differentiates_like_xla(problem):
     x_shape, kernel_shape, options = problem

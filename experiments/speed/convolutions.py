@@ -51,6 +51,10 @@ def layers(batch: int, height: int, width: int) -> list[Layer]:
               (batch, 2 * side, 2 * side, 2 * depth, 16), (3, 3, 3, 16, 8)),
         Layer("3x3x3, 64 -> 64", functools.partial(conv, padding=1),
               (batch, side, side, depth, 64), (3, 3, 3, 64, 64)),
+        Layer("3x3, 512 -> 512, of one pixel", functools.partial(conv, padding=1),
+              (24 * batch, 1, 1, 512), (3, 3, 512, 512)),
+        Layer("3x3 stride 2, 64 -> 512, of 2x4 pixels", functools.partial(conv, stride=2, padding=1),
+              (24 * batch, 2, 4, 64), (3, 3, 64, 512)),
     ]
 
 

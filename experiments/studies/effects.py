@@ -127,9 +127,11 @@ def _order(study: tables.Study, runs: Mapping[str, Mapping[str, Any]], suffix: s
     rank = stats.spearmanr(means[:, 0], means[:, 1])
     width = 1.96 / math.sqrt(max(len(means) - 3, 1))  # of Fisher's z
     limits = [float(np.tanh(np.arctanh(np.clip(rank.statistic, -0.999, 0.999)) + sign * width)) for sign in (-1, 1)]
-    rows = [("another domain lowers PSNR", len(drop), mean, [low, high], verdict(low, high, "better", 0.0)),
+    learned = any(lead(run, known, metric) > 0.0 for label in both for run in runs[label].values())
+    judged = lambda low, high: verdict(low, high, "better", 0.0) if suffix or learned else TOO_SHORT
+    rows = [("another domain lowers PSNR", len(drop), mean, [low, high], judged(low, high)),
             ("another domain keeps the order of the arms (Spearman correlation)", len(means), float(rank.statistic),
-             limits, verdict(*limits, "better", 0.0))]
+             limits, judged(*limits))]
     return [{"claim": claim, "metric": metric, "split": f"{known} to {other}", "pairs": count, "effect": effect,
              "interval": interval, "verdict": said, "pairs_needed": None, "updates_needed": None}
             for claim, count, effect, interval, said in rows]

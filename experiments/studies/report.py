@@ -29,7 +29,7 @@ def write(folder: pathlib.Path, study: tables.Study, results: Mapping[str, Any])
             parts += [f"## Imagined frames of `{split}`", _scores(study, runs, results, split)]
     if _draw(folder / CURVES, study, runs):
         parts += ["## Over training steps", folder / CURVES,
-                  "Mean over seeds, band from the lowest to the highest; 16 windows of each split."]
+                  "Mean over seeds, band from the lowest to the highest; a few windows of each split."]
     for suffix, title in (("", "The paper's claims, asked without memory"), ("+memory", "Asked again with memory")):
         rows = effects.of_claims(study, runs, suffix)
         if rows:

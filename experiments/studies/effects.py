@@ -127,13 +127,15 @@ def _order(study: tables.Study, runs: Mapping[str, Mapping[str, Any]], suffix: s
     rank = stats.spearmanr(means[:, 0], means[:, 1])
     width = 1.96 / math.sqrt(max(len(means) - 3, 1))  # of Fisher's z
     limits = [float(np.tanh(np.arctanh(np.clip(rank.statistic, -0.999, 0.999)) + sign * width)) for sign in (-1, 1)]
-    learned = any(lead(run, known, metric) > 0.0 for label in both for run in runs[label].values())
-    judged = lambda low, high: verdict(low, high, "better", 0.0) if suffix or learned else TOO_SHORT
+    every = [run for label in both for run in runs[label].values()]
+    told = bool(suffix) or any(lead(run, known, metric) > 0.0 for run in every)
+    updates = None if told else updates_needed(every, known, metric)
+    judged = lambda low, high: verdict(low, high, "better", 0.0) if told else TOO_SHORT
     rows = [("another domain lowers PSNR", len(drop), mean, [low, high], judged(low, high)),
             ("another domain keeps the order of the arms (Spearman correlation)", len(means), float(rank.statistic),
              limits, judged(*limits))]
     return [{"claim": claim, "metric": metric, "split": f"{known} to {other}", "pairs": count, "effect": effect,
-             "interval": interval, "verdict": said, "pairs_needed": None, "updates_needed": None}
+             "interval": interval, "verdict": said, "pairs_needed": None, "updates_needed": updates}
             for claim, count, effect, interval, said in rows]
 
 

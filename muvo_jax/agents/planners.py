@@ -143,7 +143,7 @@ def gradient(objective: Objective, key: Array, start: Array, config: PlannerConf
 
     first = (plans, optimizer.init(plans), Plan(start, jnp.float32(-jnp.inf)))
     (plans, _, best), _ = jax.lax.scan(iterate, first, jax.random.split(key, config.iterations))
-    return better(best, plans, objective(key, plans))
+    return better(best, plans, objective(jax.random.fold_in(key, config.iterations), plans))
 
 
 def _checked(start: Array) -> Array:

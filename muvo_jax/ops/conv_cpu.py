@@ -26,8 +26,8 @@ Pairs = tuple[tuple[int, int], ...]
 
 _CHUNK_BYTES = 1 << 20  # what one pass over the kernel taps reads: half of a core's second-level cache
 _LITTLE_WORK = 5e8  # floating-point operations of a kernel gradient below which XLA's own one is at least as fast
-# A layer of so few pixels a sample and so many weights a tap is faster as a matrix product: 40 times at one pixel of
-# 512 channels; at 64 pixels of 128 channels it no longer is.
+# A layer of so few pixels a sample and so many weights a tap is faster as a matrix product: 17 times at one pixel of
+# 512 channels, with gradients (experiments/speed/convolutions.md); at 64 pixels of 128 channels it no longer is.
 _FEW_PIXELS = 8
 _MANY_WEIGHTS = 1 << 14
 _FOLDED_WIDTH = 16  # output channels of a folded block below which the matrix product starves

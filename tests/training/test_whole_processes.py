@@ -104,11 +104,13 @@ def test_a_run_killed_at_every_bad_moment_and_stopped_twice_logs_what_one_left_a
     assert logged(folder) == alone
 
 
-def test_two_hosts_share_a_state_train_as_one_stop_together_and_one_goes_on_alone(start, alone, tmp_path):
-    folder = tmp_path / "run"
-    codes, texts = ended(start(folder, f"--steps={STEPS}", "--set=train.share_state=true", hosts=2, STOP_AT={1: "1"}))
+@pytest.mark.parametrize("share", [False, True], ids=["whole", "shared"])
+def test_two_hosts_train_as_one_stop_together_and_one_goes_on_without_the_other(start, alone, tmp_path, share):
+    folder, sharing = tmp_path / "run", ["--set=train.share_state=true"] if share else []
+    codes, texts = ended(start(folder, f"--steps={STEPS}", *sharing, hosts=2, STOP_AT={1: "1"}))
     assert codes == [0, 0], texts
-    assert "over 2 cpu devices of 2 hosts, which share the state" in texts[0] and "steps" not in texts[1]
+    assert "over 2 cpu devices of 2 hosts" in texts[0] and "steps" not in texts[1]
+    assert ("which share the state" in texts[0]) == share
     stopped_at = max(record["step"] for record in logged(folder))
     assert stopped_at < 4 and f"stopped at step {stopped_at} of 6; saved" in texts[0], texts
     assert_close(logged(folder), alone[:len(logged(folder))])

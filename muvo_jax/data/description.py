@@ -4,17 +4,18 @@ from __future__ import annotations
 
 import dataclasses
 import difflib
+import json
 import pathlib
 from collections.abc import Callable, Collection
 from typing import Any
 
 from muvo_jax import config as config_lib
-from muvo_jax.data import schema
+from muvo_jax.data import files, schema
 
 _SECTIONS: dict[str, Callable] = {"camera": schema.Camera, "lidar": config_lib.RangeViewGeometry,
                                   "voxels": config_lib.VoxelGrid, "action": config_lib.ActionContract,
                                   "route_map": config_lib.RouteMap}
-_SAME_RATE = 0.01
+SAME_RATE = 0.01
 
 
 def tables(**sections) -> dict[str, dict[str, Any]]:
@@ -86,7 +87,7 @@ def contract(header: dict, path: pathlib.Path, rate_hz: float) -> config_lib.Act
     if isinstance(given, dict) and "rate_hz" not in given:
         header = header | {"action": given | {"rate_hz": rate_hz}}
     found = section(header, "action", path, required=False)
-    if found is not None and abs(found.rate_hz / rate_hz - 1.0) > _SAME_RATE:
+    if found is not None and abs(found.rate_hz / rate_hz - 1.0) > SAME_RATE:
         raise schema.DataError(f"{path}: rate_hz is {rate_hz:g}, but action.rate_hz is {found.rate_hz:g}: a step would "
                                f"last two times. An action belongs to each frame; leave action.rate_hz out, or make "
                                f"both the frames' rate.")
@@ -121,3 +122,21 @@ def check_names(header: dict, path: pathlib.Path, known: Collection[str]) -> Non
         near = difflib.get_close_matches(name, names, n=1, cutoff=0.7)
         if name not in names and near:
             raise schema.DataError(f"{path}: {name!r} is unknown. Did you mean {near[0]}?")
+
+
+def check_rule(folder: pathlib.Path, grid: config_lib.VoxelGrid) -> None:
+    """Raises DataError where occupancy says (files.RULE_FILE) that it was made for another grid than described."""
+    path = folder / files.RULE_FILE
+    if not path.is_file():
+        return
+    try:
+        made_for = json.loads(files.read_bytes(path, "the rule that occupancy was made by"))
+        found = {name: made_for[name] for name in dataclasses.asdict(grid)}
+    except (ValueError, KeyError, TypeError, RecursionError) as error:
+        raise schema.DataError(f"{path}: does not say by which rule and grid the files there were made ({error}). Make "
+                               f"them again (python -m muvo_jax.voxelize --overwrite), or remove it.") from error
+    described = json.loads(json.dumps(dataclasses.asdict(grid)))
+    if found != described:
+        raise schema.DataError(f"{folder}: occupancy was made for {found}, but the grid is described with {described}. "
+                               f"Correct the section [voxels], or make it again (python -m muvo_jax.voxelize "
+                               f"--overwrite).")

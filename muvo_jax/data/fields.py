@@ -103,7 +103,7 @@ TABLE = (
     # A little beyond 1 is rounding.
     Field("action", np.float32, (2,), limits=between(-1.001, 1.001), columns=("acceleration", "steering"),
           required=True),
-    Field("reward", np.float32, columns=("reward",)),
+    Field("reward", np.float32, limits=between(-1e9, 1e9), columns=("reward",)),
     Field("is_terminal", np.bool_, values=(0, 1), columns=("is_terminal",)),
     Field("pose", np.float64, (3,), "m and rad", columns=("x_m", "y_m", "yaw_rad")),
     Field("yaw_rate_radps", np.float32, unit="rad/s", limits=between(-20, 20, "rad/s"), columns=("yaw_rate_radps",)),
@@ -133,11 +133,7 @@ def conform(name: str, values: Any, where: str, shape: tuple[int | None, ...] | 
     """
     field, array = FIELDS[name], np.asarray(values)
     wanted = tuple(None if isinstance(size, str) else size for size in field.shape) if shape is None else shape
-    if array.ndim != len(wanted) or any(want not in (None, size) for want, size in zip(wanted, array.shape,
-                                                                                         strict=True)):
-        raise DataError(f"{where}: shape {list(array.shape)} of {name}, expected "
-                        f"{['any' if size is None else size for size in wanted]}. Do not mix recordings of different "
-                        f"settings in one folder.")
+    check_shape(name, array.shape, wanted, where)
     whole = np.issubdtype(field.dtype, np.integer) or field.dtype is np.bool_
     if array.dtype.kind not in ("biu" if whole else "f" if field.folder else "fiu"):
         raise DataError(f"{where}: {name} holds {array.dtype}, expected {np.dtype(field.dtype).name}"
@@ -146,13 +142,21 @@ def conform(name: str, values: Any, where: str, shape: tuple[int | None, ...] | 
     return array.astype(field.dtype, copy=False)
 
 
+def check_shape(name: str, shape: tuple[int, ...], wanted: tuple[int | None, ...], where: str) -> None:
+    """Raises DataError where a field has another shape; None is any size."""
+    if len(shape) != len(wanted) or any(want not in (None, size) for want, size in zip(wanted, shape, strict=True)):
+        raise DataError(f"{where}: shape {list(shape)} of {name}, expected "
+                        f"{['any' if size is None else size for size in wanted]}. Do not mix recordings of different "
+                        f"settings in one folder.")
+
+
 def _check_range(field: Field, array: np.ndarray, where: str) -> None:
     """Raises DataError where a number is none that the field can have."""
     if not array.size or (field.limits is FINITE and not field.values and array.dtype.kind != "f") or (
             array.dtype.kind == "b" and field.dtype is np.bool_):
         return
-    if not field.finite and not np.isfinite(array.max()):
-        array = array[~(np.isnan(array) | (array == np.inf))]
+    if not field.finite and not np.isfinite([array.max(), array.min()]).all():
+        array = array[np.isfinite(array) | ((array == -np.inf) & (field.limits.lowest >= 0))]
     if field.values:
         wrong = ~np.isin(array, field.values)
         expected = f"one of {', '.join(map(str, field.values))}"

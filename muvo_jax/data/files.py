@@ -22,12 +22,16 @@ from PIL import Image, ImageOps
 
 from muvo_jax.data import schema
 
+LARGEST_ARRAY_BYTES = 1 << 30  # what a field of a frame may claim before memory is taken for it
 BAD_POINT_SHARE = 0.01  # more non-finite points than this are a broken file, not noise
 DEPTH_UNIT_M, DEPTH_SKY = 0.01, 65535  # of pictures of depth
 PICTURE_FORMATS = ("PNG", "JPEG")  # as Pillow names them
+# Read under such a name, too. Of all that Pillow knows, some start other programs (Ghostscript).
+_FORMATS = (*PICTURE_FORMATS, "BMP", "TIFF")
 PICTURE_MODES = ("RGB", "RGBA", "L", "classes", "depth_m")
 _HEADER_TRIES = 8
-_NOT_FRAMES = ("Thumbs.db", "desktop.ini", "rule.json")  # the last one is voxelizing.RULE_FILE
+RULE_FILE = "rule.json"  # beside occupancy: how it was made
+_NOT_FRAMES = ("Thumbs.db", "desktop.ini", RULE_FILE)
 # Pillow raises any of these for broken chunks and for sizes that would fill the memory.
 _IMAGE_ERRORS = (OSError, SyntaxError, ValueError, TypeError, IndexError, OverflowError, MemoryError, zlib.error,
                  struct.error, Image.DecompressionBombError)
@@ -59,6 +63,17 @@ def keeping_pictures() -> Iterator[list[Picture]]:
         _keeping.reset(token)
 
 
+def read_bytes(path: pathlib.Path, what: str) -> bytes:
+    """The content of a file; raises DataError, which calls it `what`, where it is missing or cannot be read."""
+    try:
+        return path.read_bytes()
+    except FileNotFoundError as error:
+        raise missing(path, what) from error
+    except OSError as error:
+        raise schema.DataError(f"{path}: expected {what}, but it cannot be read ({error}). Correct its permissions, or "
+                               f"copy it again.") from error
+
+
 def read_image(path: pathlib.Path, mode: str | None) -> np.ndarray:
     """Returns a PNG or JPEG in one of these ways:
 
@@ -71,12 +86,7 @@ def read_image(path: pathlib.Path, mode: str | None) -> np.ndarray:
     Raises:
       DataError: where the file is missing, truncated, no image, or of other pixels than the mode asks for.
     """
-    try:
-        return decode_image(path.read_bytes(), mode, str(path))
-    except FileNotFoundError as error:
-        raise missing(path, "an image") from error
-    except OSError as error:
-        raise schema.DataError(f"{path}: not a readable file ({error}).") from error
+    return decode_image(read_bytes(path, "an image"), mode, str(path))
 
 
 def decode_image(content: bytes, mode: str | None, where: str, shape: tuple[int, ...] | None = None) -> np.ndarray:
@@ -90,7 +100,7 @@ def decode_image(content: bytes, mode: str | None, where: str, shape: tuple[int,
       DataError: where they are damaged, no image, or of other pixels than the mode asks for.
     """
     try:
-        with Image.open(io.BytesIO(content), formats=None if shape is None else PICTURE_FORMATS) as image:
+        with Image.open(io.BytesIO(content), formats=_FORMATS if shape is None else PICTURE_FORMATS) as image:
             if shape is not None and sorted((image.height, image.width)) != sorted(shape[:2]):
                 raise schema.DataError(f"{where}: a picture of {image.width}x{image.height} pixels, expected "
                                        f"{list(shape)}")
@@ -103,8 +113,8 @@ def decode_image(content: bytes, mode: str | None, where: str, shape: tuple[int,
     except schema.DataError:
         raise
     except _IMAGE_ERRORS as error:
-        raise schema.DataError(f"{where}: not a readable image ({error}). The file is truncated or damaged: copy it "
-                               f"again, or delete it so that the sequence is split there.") from error
+        raise schema.DataError(f"{where}: not a readable image ({error}). The file is truncated or damaged, or no PNG "
+                               f"or JPEG: copy it again, or delete it so that the sequence is split there.") from error
 
 
 def decode_depth(pixels: np.ndarray) -> np.ndarray:
@@ -152,11 +162,17 @@ def read_npz(path: pathlib.Path, name: str) -> np.ndarray:
             if file.read(len(np.lib.format.MAGIC_PREFIX)) == np.lib.format.MAGIC_PREFIX:
                 raise schema.DataError(f"{path}: a single array (NPY) under the name of an NPZ file; write it with "
                                        f"np.savez and the name {name!r}.")
+            with zipfile.ZipFile(file) as archive:
+                sizes = [entry.file_size for entry in archive.infolist() if entry.filename == f"{name}.npy"]
+                names = archive.namelist()
+            if not sizes:  # np.load would also give, as bytes of any size, a member without the suffix
+                held = ", ".join(name.removesuffix(".npy") for name in names if name.endswith(".npy"))
+                raise schema.DataError(f"{path}: holds {held or 'no array'}, expected an array {name!r}.")
+            if max(sizes) > LARGEST_ARRAY_BYTES:
+                raise schema.DataError(f"{path}: {name!r} unpacks to {max(sizes)} bytes, more than the "
+                                       f"{LARGEST_ARRAY_BYTES} that a field of a frame may have.")
             file.seek(0)
-            arrays = np.load(file, allow_pickle=False)
-            if name not in arrays:
-                raise schema.DataError(f"{path}: holds {', '.join(arrays) or 'nothing'}, expected an array {name!r}.")
-            return _one_of(arrays, name)
+            return _one_of(np.load(file, allow_pickle=False), f"{name}.npy")
     except FileNotFoundError as error:
         raise missing(path, f"an NPZ file with {name!r}") from error
     except schema.DataError:
@@ -175,23 +191,44 @@ def _one_of(arrays: Mapping[str, np.ndarray], name: str) -> np.ndarray:
     return arrays[name]
 
 
-def npz_holds(path: pathlib.Path, name: str) -> bool:
-    """Whether a readable NPZ file has an array of that name."""
+def npz_names(path: pathlib.Path) -> frozenset[str] | None:
+    """The names of the arrays in an NPZ file; None where it cannot be read."""
     try:
         with zipfile.ZipFile(path) as archive:
-            return f"{name}.npy" in archive.namelist()
+            return frozenset(name.removesuffix(".npy") for name in archive.namelist())
     except _ARCHIVE_ERRORS:
-        return False
+        return None
 
 
 def read_toml(path: pathlib.Path) -> dict:
     """Returns a parsed TOML file; raises DataError where it is missing or malformed."""
     try:
-        return tomllib.loads(path.read_text(encoding="utf-8-sig"))  # editors may write a byte order mark
-    except FileNotFoundError as error:
-        raise missing(path, "a TOML description") from error
+        text = read_bytes(path, "a TOML description").decode("utf-8-sig")  # editors may write a byte order mark
+        return tomllib.loads(text.replace("\r\n", "\n").replace("\r", "\n"))
     except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
         raise schema.DataError(f"{path}: not valid TOML ({error}).") from error
+
+
+def is_folder_name(name: str) -> bool:
+    """Whether a name is that of a folder inside another one, and of none that readers pass over."""
+    return bool(name) and not name.startswith(".") and not set("/\\\0:") & set(name)
+
+
+def names_in(folder: pathlib.Path | str | bytes) -> list:
+    """The names in a folder, sorted; none where there is no folder. A link to nowhere, as git-annex and DVC leave it
+    for what was not fetched, is no file.
+
+    Raises:
+      DataError: where the folder cannot be read.
+    """
+    try:
+        with os.scandir(folder) as entries:  # type: ignore[type-var]
+            return sorted(entry.name for entry in entries if not entry.is_symlink() or os.path.exists(entry.path))
+    except (FileNotFoundError, NotADirectoryError):
+        return []
+    except OSError as error:
+        raise schema.DataError(f"{os.fsdecode(folder)}: the folder cannot be read ({error}). Correct its permissions."
+                               ) from error
 
 
 def missing(path: pathlib.Path, what: str) -> schema.DataError:
@@ -237,12 +274,10 @@ def numbered(folder: pathlib.Path, suffixes: str | Sequence[str]) -> dict[int, s
     Raises:
       DataError: where two files are of one frame, or files are there but none is named by a number.
     """
-    if not folder.is_dir():
-        return {}
     order = {suffix: place for place, suffix in enumerate([suffixes] if isinstance(suffixes, str) else suffixes)}
     found: dict[int, str] = {}
     others: list[str] = []
-    for name in sorted(os.listdir(folder)):
+    for name in names_in(folder):
         stem, suffix = os.path.splitext(name)
         if name.startswith(".") or name in _NOT_FRAMES:
             continue

@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 
 from muvo_jax import config as config_lib
 from muvo_jax import head as head_lib
+from muvo_jax.config import settings
 from muvo_jax.data import prepare, schema, sequences, windows
 
 SHORT_RECORDING_FRAMES = 100
@@ -16,6 +17,8 @@ _SHORT = {"stride": 1, "context": 4, "horizon": 4, "frames": 8}
 _SIDE_MULTIPLE = 32
 # What a trained network was built with: give it to `adapt` to keep, beside what the user chose.
 OF_TRAINED = ("model.range_view.rows", "model.range_view.columns")
+# What a recording says of itself: what a user says of it cannot be otherwise.
+_RECORDED = ("contract", "data.route_map", "model.range_view", "model.semantic_classes", "model.voxels")
 
 
 class Adapted(NamedTuple):
@@ -42,7 +45,8 @@ def adapt(config: config_lib.Config, recording: schema.Recording, *, keep: Colle
 
     Raises:
       DataError: where the recording lacks what every model needs (actions, and camera or lidar), its voxel grid
-        does not suit the voxel decoder, or its sequences are shorter than a window.
+        does not suit the voxel decoder, its sequences are shorter than a window, or the user chose what it says
+        otherwise.
     """
     description = recording.description
     notes: list[str] = []
@@ -55,7 +59,9 @@ def adapt(config: config_lib.Config, recording: schema.Recording, *, keep: Colle
     train = config.train
     if train.observe_frames > data.context and "train.observe_frames" not in keep:  # as many as evaluation observes
         train = dataclasses.replace(train, observe_frames=data.context)
-    return Adapted(dataclasses.replace(config, model=model, data=data, train=train, contract=contract), tuple(notes))
+    fitted = dataclasses.replace(config, model=model, data=data, train=train, contract=contract)
+    _check_chosen(config, fitted, description, keep)
+    return Adapted(fitted, tuple(notes))
 
 
 def check_targets(config: config_lib.Config, description: schema.RecordingDescription) -> None:
@@ -72,6 +78,20 @@ def check_targets(config: config_lib.Config, description: schema.RecordingDescri
             others = ",".join(name for name in config.model.heads if name != head)
             raise schema.DataError(f"head {head!r} learns from {field}, which recording {description.name!r} does not "
                                    f"hold. Leave the head out (--heads={others}), or record {field}.")
+
+
+def _check_chosen(config: config_lib.Config, fitted: config_lib.Config, description: schema.RecordingDescription,
+                  keep: Collection[str]) -> None:
+    """Raises DataError for a setting of the user's that the recording says otherwise: it would not count."""
+    found = settings.names(dataclasses.asdict(fitted))
+    for name, asked in settings.names(dataclasses.asdict(config)).items():
+        if _within(name, keep) and _within(name, _RECORDED) and found[name] != asked:
+            raise schema.DataError(f"{name} is set to {asked!r}, but recording {description.name!r} says "
+                                   f"{found[name]!r}, and that counts. Leave the setting out.")
+
+
+def _within(name: str, sections: Collection[str]) -> bool:
+    return any(f"{name}.".startswith(f"{section}.") for section in sections)
 
 
 def _columns(model: config_lib.ModelConfig, lidar: config_lib.RangeViewGeometry) -> int:
@@ -233,10 +253,12 @@ def _fit_windows(data: config_lib.DataConfig, recording: schema.Recording, keep:
                  notes: list[str]) -> config_lib.DataConfig:
     lengths = {split: sequences.longest(recording.sequences, split, needs) for split in recording.description.splits
                if splits is None or split in splits}
-    if lengths.get("train", 0) < SHORT_RECORDING_FRAMES and _too_long(data, lengths):
+    # How long a recording is, its training split says, also where that is not read.
+    trained = sequences.longest(recording.sequences, "train", needs)
+    if trained < SHORT_RECORDING_FRAMES and _too_long(data, lengths):
         changes: dict = {name: value for name, value in _SHORT.items() if f"data.{name}" not in keep}
         data = dataclasses.replace(data, **changes)
-        notes.append(f"short recording (longest training sequence: {lengths.get('train', 0)} frames): "
+        notes.append(f"short recording (longest training sequence: {trained} frames): "
                      f"stride {data.stride}, context {data.context}, horizon {data.horizon}, {data.frames} frames to "
                      f"train on.")
     split = _too_long(data, lengths)

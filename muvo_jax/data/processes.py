@@ -19,6 +19,10 @@ _Result = TypeVar("_Result")
 _shared: tuple = ()  # of a worker: what all of its tasks need
 
 
+class WorkerError(ChildProcessError, RuntimeError):
+    """A worker process was killed or has failed; the message says what to do. An OSError: commands expect these."""
+
+
 def processors() -> int:
     """How many processors this process may use: what a number of workers is where none is asked for."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
@@ -36,15 +40,15 @@ def spread(work: Callable[..., _Result], tasks: Iterable[Any], *, shared: tuple,
 
     Raises:
       Exception: what `work` raises, as it is; tasks that have not begun are given up.
-      RuntimeError: where a process is killed.
+      WorkerError: where a process is killed.
     """
     pool = futures.ProcessPoolExecutor(workers, multiprocessing.get_context("spawn"), _begin, (shared,))
     try:
         for future in futures.as_completed([pool.submit(_run, work, task) for task in tasks]):
             yield future.result()
     except process.BrokenProcessPool as error:
-        raise RuntimeError(f"a {doing} process was killed (is memory short?); run again, what is complete is "
-                           f"kept.") from error
+        raise WorkerError(f"a {doing} process was killed (is memory short?); run again, what is complete is "
+                          f"kept.") from error
     finally:
         pool.shutdown(cancel_futures=True)
 
@@ -84,3 +88,14 @@ def locked(path: pathlib.Path, doing: str, *, wait: bool = False) -> Iterator[No
     except filelock.Timeout as error:
         raise BlockingIOError(f"{path.parent}: another process is {doing} here now; wait for it, or choose another "
                               f"folder.") from error
+
+
+def check_free(paths: Iterable[pathlib.Path], doing: str) -> None:
+    """Raises BlockingIOError where another process holds the lock of one of these files, as far as they are there.
+
+    Two that each hold their own and look at the other's both find it held.
+    """
+    for path in paths:
+        if path.exists():
+            with locked(path, doing):
+                pass

@@ -16,7 +16,7 @@ import numpy as np
 from muvo_jax import config as config_lib
 from muvo_jax import geometry
 from muvo_jax.data.errors import DataError, DataWarning
-from muvo_jax.data.fields import LABELS
+from muvo_jax.data.fields import FIELDS, LABELS
 from muvo_jax.limits import RangeError, between, check
 from muvo_jax.ops import camera as camera_ops
 
@@ -199,6 +199,20 @@ class RecordingDescription:
     notes: tuple[str, ...] = ()
     classes: tuple[str, ...] = ()
     route_map: config_lib.RouteMap | None = None
+
+    def shape_of(self, name: str) -> tuple[int | None, ...]:
+        """See the function `shape_of`."""
+        return shape_of(name, self.camera, self.voxels)
+
+
+def shape_of(name: str, camera: Camera | None, voxels: config_lib.VoxelGrid | None) -> tuple[int | None, ...]:
+    """Of a recorded field, as camera and voxels say it; None where they do not."""
+    sizes: dict[str, int] = {}
+    if camera is not None:
+        sizes |= {"H": camera.height_px, "W": camera.width_px}
+    if voxels is not None:
+        sizes |= dict(zip("XYZ", voxels.shape, strict=True))
+    return tuple(sizes.get(size) if isinstance(size, str) else size for size in FIELDS[name].shape)
 
 
 class Recording(Protocol):

@@ -10,6 +10,7 @@ import numpy as np
 from muvo_jax.data import schema, words
 
 GAP_PERIODS = 1.5  # a time step longer than this many periods is a gap
+SAME_RATE = 0.1  # the share by which a run's usual step may differ from the recording's
 FEW_SHARE = 0.05  # gaps at no more frames than these (or at one) are what recordings have; more are a fault
 
 
@@ -29,6 +30,17 @@ def after_gap(timestamps_s: np.ndarray, period_s: float) -> np.ndarray:
     late = np.zeros(len(timestamps_s), bool)
     late[1:] = np.diff(timestamps_s) > GAP_PERIODS * period_s
     return late
+
+
+def warn_of_rate(where: str, timestamps_s: np.ndarray, period_s: float) -> None:
+    """Warns where a run's usual step is shorter or longer than the recording's; after_gap tells of steps left out."""
+    if len(timestamps_s) < 3:
+        return
+    usual_s = float(np.median(np.diff(timestamps_s)))
+    if usual_s < (1.0 - SAME_RATE) * period_s or (1.0 + SAME_RATE) * period_s < usual_s <= GAP_PERIODS * period_s:
+        warnings.warn(f"{where}: frames follow each other after {usual_s:.4g} s, in the recording after {period_s:.4g} "
+                      f"s: speeds and actions would count for another time. Correct rate_hz or the time stamps, or "
+                      f"keep runs of another rate in a recording of their own.", schema.DataWarning, stacklevel=4)
 
 
 def gap_free(present: np.ndarray, breaks: np.ndarray) -> list[tuple[int, int]]:

@@ -8,7 +8,8 @@ and label for label as the authors' generate_voxels.
     MUVO layout, carved         <run>/occupancy/occupancy_000000012.npz; their code does not look there, ours does
     MUVO layout, reference      <run>/voxel/voxel_000000012.npy, and the column voxel_path in pd_dataframe.pkl
 
-rule.json beside the files says how they were made; files of two rules or grids are never mixed.
+Files are numbered as the frame's others. rule.json beside them says how they were made; files of two rules or grids
+are never mixed.
 """
 
 from __future__ import annotations
@@ -20,13 +21,13 @@ import math
 import pathlib
 import shutil
 import zipfile
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from typing import NamedTuple
 
 import numpy as np
 
 from muvo_jax import config as config_lib
-from muvo_jax.data import description, files, processes, schema
+from muvo_jax.data import description, fields, files, processes, schema
 from muvo_jax.data.muvo import files as muvo_files
 from muvo_jax.data.muvo import frame_pickle, safe_pickle
 from muvo_jax.data.muvo import reader as muvo_reader
@@ -37,7 +38,6 @@ from muvo_jax.ops import camera as camera_ops
 from muvo_jax.ops import voxels as voxel_ops
 
 RULES = ("carved", "reference")
-RULE_FILE = "rule.json"
 ORIGINAL_FRAME_FILE = "pd_dataframe.before_voxels.pkl"
 _LOCK_FILE = ".voxelizing"
 _CHUNK = 4  # frames that a process makes at a time
@@ -84,7 +84,7 @@ def voxelize(path: pathlib.Path | str, *, rule: str = "carved", overwrite: bool 
     Raises:
       DataError: for a path of another kind, without depth or lidar, without a described grid; or, when all other
         frames are done, for frames that cannot be made.
-      FileExistsError: where files of another rule or grid are there.
+      FileExistsError: where files of another rule or grid are there, or of one that no rule.json says.
       BlockingIOError: where another process works on `path`.
       RuntimeError: where a worker was killed.
     """
@@ -94,13 +94,14 @@ def voxelize(path: pathlib.Path | str, *, rule: str = "carved", overwrite: bool 
     rig, runs = _survey(path, rule)
     frames = [frame for run in runs.values() for frame in run]
     with processes.locked(path / _LOCK_FILE, "voxelizing"):
-        rule_text = json.dumps({"rule": rule} | dataclasses.asdict(rig.grid)) + "\n"
+        processes.check_free(_other_locks(path, runs), "voxelizing")
+        rule_text = json.dumps({"rule": rule} | dataclasses.asdict(rig.grid)) + "\n"  # description.check_rule reads it
         for folder in {frame.target.parent for frame in frames}:
             _clear(folder, rule_text, overwrite)
         missing = [frame for frame in frames if not is_whole(frame.target)]
         for folder in {frame.target.parent for frame in missing}:
             folder.mkdir(exist_ok=True)
-            files.write_atomically(folder / RULE_FILE, rule_text)
+            files.write_atomically(folder / files.RULE_FILE, rule_text)
         kept = len(frames) - len(missing)
         chunks = [missing[first:first + _CHUNK] for first in range(0, len(missing), _CHUNK)]
         workers = min(workers or processes.processors(), len(chunks))
@@ -123,6 +124,15 @@ def voxelize(path: pathlib.Path | str, *, rule: str = "carved", overwrite: bool 
     return Result(made=len(missing), kept=kept)
 
 
+def _other_locks(path: pathlib.Path, runs: Collection[pathlib.Path]) -> list[pathlib.Path]:
+    """Of whoever may work on some of these runs by another path: one above, or one between it and the runs."""
+    here = path.resolve()
+    between = {parent for run in runs for parent in (run.resolve(), *run.resolve().parents)
+               if parent.is_relative_to(here)}
+    above = here.parents[:muvo_runs.MOST_LEVELS]
+    return [folder / _LOCK_FILE for folder in sorted({*between, *above} - {here})]
+
+
 def make_frames(rig: Rig, frames: list[Frame]) -> list[str]:
     """Makes frames; what was wrong with each, or an empty string."""
     outcomes = []
@@ -142,13 +152,28 @@ def is_whole(path: pathlib.Path) -> bool:
         return False
     if path.suffix == ".npz":
         return zipfile.is_zipfile(path)
+    header = _npy_header(path)
+    return (header is not None and not header.dtype.hasobject
+            and path.stat().st_size == header.size + math.prod(header.shape) * header.dtype.itemsize)
+
+
+class _Header(NamedTuple):
+    """Of an .npy file; `size` in bytes."""
+
+    shape: tuple[int, ...]
+    dtype: np.dtype
+    size: int
+
+
+def _npy_header(path: pathlib.Path) -> _Header | None:
+    """None where it is cut off or damaged."""
     with path.open("rb") as file:
         try:
             np.lib.format.read_magic(file)
             shape, _, dtype = np.lib.format.read_array_header_1_0(file)
         except (ValueError, EOFError):
-            return False
-        return not dtype.hasobject and path.stat().st_size == file.tell() + math.prod(shape) * dtype.itemsize
+            return None
+        return _Header(shape, dtype, file.tell())
 
 
 def carved_occupancy(depth_m: np.ndarray, points_m: np.ndarray, intrinsics: np.ndarray, camera_to_ego: np.ndarray,
@@ -221,8 +246,7 @@ def _survey_plain(path: pathlib.Path, rule: str) -> tuple[Rig, dict[pathlib.Path
 
 
 def _survey_muvo(path: pathlib.Path, rule: str) -> tuple[Rig, dict[pathlib.Path, list[Frame]]]:
-    toml_path = path / muvo_reader.SENSORS_FILE
-    header = files.read_toml(toml_path) if toml_path.is_file() else {}
+    header, toml_path = muvo_reader.read_sensors(path)
     camera, lidar, grid = (description.section(header, name, toml_path, required=False)
                            for name in ("camera", "lidar", "voxels"))
     runs = {}
@@ -231,23 +255,41 @@ def _survey_muvo(path: pathlib.Path, rule: str) -> tuple[Rig, dict[pathlib.Path,
         if lacking:
             raise schema.DataError(f"{run.folder / muvo_runs.FRAME_FILE}: no column {lacking[0]}_path; occupancy is "
                                    f"made from depth and lidar. Record both.")
-        name = muvo_reader.occupancy_name if rule == "carved" else lambda row: muvo_files.file_name("voxel", row)
-        runs[run.folder] = [Frame(run.path("depth_semantic", row), run.path("points_semantic", row),
-                                  run.folder / name(row)) for row in range(run.frames)]
+        names = (muvo_reader.occupancy_names(run) if rule == "carved" else
+                 [muvo_files.file_name("voxel", number) for number in muvo_runs.numbering(run).tolist()])
+        runs[run.folder] = [Frame(run.path("depth_semantic", row), run.path("points_semantic", row), run.folder / name)
+                            for row, name in enumerate(names)]
     return Rig(True, rule, camera, (lidar or muvo_reader.LIDAR).position_m, grid or muvo_reader.VOXELS), runs
 
 
 def _clear(folder: pathlib.Path, rule_text: str, overwrite: bool) -> None:
     """Removes what an interrupted write left in a folder of results, and all results where that is wanted."""
-    path = folder / RULE_FILE
+    path = folder / files.RULE_FILE
     if overwrite:
         for old in folder.glob("*.np[yz]"):
             old.unlink()
-    elif path.is_file() and path.read_text(encoding="utf-8") != rule_text:
-        raise FileExistsError(f"{path}: the files there were made by {path.read_text(encoding='utf-8').strip()}, not "
-                              f"by {rule_text.strip()}. --overwrite removes them and makes all anew.")
+    elif path.is_file() and (found := files.read_bytes(path, "a rule").decode(errors="replace")) != rule_text:
+        raise FileExistsError(f"{path}: the files there were made by {found.strip()[:300]}, not by "
+                              f"{rule_text.strip()}. --overwrite removes them and makes all anew.")
+    elif not path.is_file():
+        _check_unruled(folder)
     for draft in folder.glob(".*.np[yz].*"):
         draft.unlink()
+
+
+def _check_unruled(folder: pathlib.Path) -> None:
+    """Raises FileExistsError for files that nobody noted a rule and grid of; the authors' tables of voxels need none.
+
+    Tables that are cut off pass, too: they are made again.
+    """
+    for path in sorted(folder.glob("[!.]*.np[yz]")):
+        header = _npy_header(path) if path.suffix == ".npy" else None
+        if header is not None and (len(header.shape) != 2 or header.shape[1] != 4 or header.dtype.kind not in "ui"):
+            raise FileExistsError(f"{path}: {header.dtype} {list(header.shape)}, expected a table of voxels, whole "
+                                  f"numbers [M, 4]. --overwrite removes the files there and makes all anew.")
+        if path.suffix == ".npz":
+            raise FileExistsError(f"{path}: no {files.RULE_FILE} beside it says by which rule and grid it was made. "
+                                  f"--overwrite removes the files there and makes all anew; or move them away.")
 
 
 def _content(rig: Rig, frame: Frame) -> bytes:
@@ -255,6 +297,7 @@ def _content(rig: Rig, frame: Frame) -> bytes:
     if rig.is_muvo:
         depth, tags = muvo_files.read_depth_semantic(frame.depth)
         scan = muvo_files.read_points(frame.points, rig.lidar_position_m)
+        fields.conform("points_m", scan.points_m, str(frame.points))
         if rig.rule == "reference":
             file = io.BytesIO()
             np.save(file, _reference_table(rig, frame, depth * muvo_files.DEPTH_RANGE_M, tags, scan))
@@ -262,13 +305,7 @@ def _content(rig: Rig, frame: Frame) -> bytes:
         keep: Callable[[np.ndarray], np.ndarray] = _without_own_car
         depth_m, points_m = np.where(depth < 1.0, depth * muvo_files.DEPTH_RANGE_M, np.inf), scan.points_m
     else:
-        depth_m = (files.read_npz(frame.depth, "depth_m") if frame.depth.suffix.lower() == ".npz" else
-                   files.read_image(frame.depth, "depth_m"))
-        points_m = files.read_npz(frame.points, "points_m").astype(np.float32)
-        if depth_m.ndim != 2 or points_m.shape[1:] != (3,):
-            raise schema.DataError(f"{frame.depth}, {frame.points}: depth of shape {list(depth_m.shape)}, points of "
-                                   f"{list(points_m.shape)}; expected [H, W] and [N, 3].")
-        points_m = files.finite_points(points_m, frame.points)
+        depth_m, points_m = _read_plain(frame)
         keep = _all
     intrinsics, camera_to_ego = _pinhole(rig.camera, depth_m.shape, frame.depth)
     if frame.calibration is not None:
@@ -280,6 +317,14 @@ def _content(rig: Rig, frame: Frame) -> bytes:
         occupancy = carved_occupancy(depth_m, points_m, intrinsics, camera_to_ego, rig.lidar_position_m, rig.grid,
                                      keep=keep)
     return files.npz_bytes({"occupancy": occupancy})
+
+
+def _read_plain(frame: Frame) -> tuple[np.ndarray, np.ndarray]:
+    """Depth [H, W] and points [N, 3], m, float32, of which the reader of the plain format would say the same."""
+    recorded = (files.read_npz(frame.depth, "depth_m") if frame.depth.suffix.lower() == ".npz" else
+                files.read_image(frame.depth, "depth_m"))
+    points_m = fields.conform("points_m", files.read_npz(frame.points, "points_m"), str(frame.points))
+    return fields.conform("depth_m", recorded, str(frame.depth)), files.finite_points(points_m, frame.points)
 
 
 def _reference_table(rig: Rig, frame: Frame, depth_m: np.ndarray, tags: np.ndarray,

@@ -86,11 +86,16 @@ def fingerprint(windows: Collection[Window]) -> str:
 def others(windows: tuple[Window, ...]) -> tuple[Window, ...]:
     """For each window another one: the first of another drive from half the list on, or what stands there."""
     count, drives = len(windows), [window.sequence.name for window in windows]
+    ends = list(range(2 * count))  # of the stretch of one drive that a place lies in; the list goes round
+    for place in range(2 * count - 2, -1, -1):
+        if drives[place % count] == drives[(place + 1) % count]:
+            ends[place] = ends[place + 1]
     found = []
     for index, drive in enumerate(drives):
-        places = [(index + count // 2 + step) % count for step in range(count)] if len(set(drives)) > 1 else []
-        found.append(next((place for place in places if drives[place] != drive), (index + count // 2) % count))
-    return tuple(windows[place] for place in found)
+        half = (index + count // 2) % count
+        place = half if drives[half] != drive else (ends[half] + 1) % count
+        found.append(windows[place if drives[place] != drive else half])
+    return tuple(found)
 
 
 class StepActions:

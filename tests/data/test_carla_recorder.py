@@ -3,6 +3,7 @@
 import importlib.util
 import json
 import math
+import pathlib
 import queue
 import sys
 import types
@@ -109,6 +110,14 @@ def test_a_collision_is_the_end_of_a_sequence_and_costs(tmp_path):
     events = queue.Queue()
     events.put("hit")
     assert [carla_client.drained(events) for _ in range(2)] == [True, False]
+
+
+def test_all_of_a_recording_goes_where_the_user_is_at_home(tmp_path, monkeypatch):
+    monkeypatch.setenv("HOME", str(tmp_path / "home"))
+    monkeypatch.chdir(tmp_path)
+    carla_recorder.record(pathlib.Path("~/recording"), FakeSimulator(), [JOB._replace(frames=2)], SETTINGS)
+    assert plain_reader.PlainRecording(tmp_path / "home/recording").sequences[0].length == 2
+    assert [path.name for path in tmp_path.iterdir()] == ["home"]
 
 
 def test_a_recording_can_be_voxelized_and_until_then_has_no_occupancy(tmp_path):
@@ -255,6 +264,13 @@ def test_plan_is_the_papers():
     assert all(job == small.get((job.split, job.run), job) for job in jobs)  # more runs keep those that there are
 
 
+@pytest.mark.parametrize("nothing", [{"towns": ()}, {"train_runs": 0, "val_runs": 0}, {"run_s": 0.0},
+                                     {"run_s": math.inf}, {"train_runs": -1}])
+def test_a_plan_without_a_frame_is_refused(nothing):
+    with pytest.raises(ValueError, match="expected a town, a run and a frame at least"):
+        carla_drives.plan(**nothing)
+
+
 def test_command_line_estimates_without_a_server(tmp_path, capsys):
     arguments = [str(tmp_path / "out"), "--estimate", "--train-runs=1", "--val-runs=0", "--towns", "Town01"]
     assert command_line.run(record_carla.Options, record_carla.record, program="record_carla", arguments=arguments) == 0
@@ -295,3 +311,12 @@ def test_every_weather_is_one_of_the_clients_and_no_server_is_one_clear_error():
         assert isinstance(getattr(carla.WeatherParameters, name), carla.WeatherParameters)
     with pytest.raises(carla_drives.CarlaError, match=r"CARLA at 127\.0\.0\.1:1: "):
         carla_client.Client(SETTINGS, port=1, timeout_s=0.2)
+
+
+def test_an_estimate_reads_the_folder_of_a_user_and_a_run_without_a_row(tmp_path, monkeypatch):
+    monkeypatch.setenv("HOME", str(tmp_path))
+    (job, *_) = jobs = carla_drives.plan(towns=("Town01",), train_runs=1, val_runs=1, run_s=10, seed=0)
+    folder = tmp_path / "rec" / job.split / job.run
+    folder.mkdir(parents=True)
+    (folder / "frames.csv").write_text("frame_id,timestamp_s\n")
+    assert carla_drives.estimate(pathlib.Path("~/rec"), jobs, carla_drives.Settings()).measured

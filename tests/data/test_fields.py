@@ -1,6 +1,7 @@
 """The table of fields: RawFrame and types.Batch agree with it, and what is read can be written and read again."""
 
 import typing
+import zipfile
 
 import numpy as np
 import pytest
@@ -232,6 +233,31 @@ def test_headers_that_two_threads_parse_at_once_are_read_again(tmp_path, monkeyp
                 raise SystemError("AST constructor recursion depth mismatch (before=51, after=48)")
             return super().__getitem__(name)
 
-    monkeypatch.setattr(np, "load", lambda file, allow_pickle: Stumbling(values=np.arange(3)))
+    monkeypatch.setattr(np, "load", lambda file, allow_pickle: Stumbling({"values.npy": np.arange(3)}))
     np.testing.assert_array_equal(files.read_npz(tmp_path / "one.npz", "values"), np.arange(3))
-    assert tries == ["values", "values"]
+    assert tries == ["values.npy", "values.npy"]
+
+
+def test_a_member_without_the_suffix_is_no_array(tmp_path, monkeypatch):
+    monkeypatch.setattr(files, "LARGEST_ARRAY_BYTES", 1 << 20)
+    with zipfile.ZipFile(tmp_path / "one.npz", "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("points_m", bytes(4 << 20))
+        archive.writestr("other.npy", b"")
+    with pytest.raises(schema.DataError, match=r"holds other, expected an array 'points_m'"):
+        files.read_npz(tmp_path / "one.npz", "points_m")
+
+
+def test_a_point_at_minus_infinity_counts_as_not_measured_a_depth_does_not():
+    points_m = np.zeros((4, 3), np.float32)
+    points_m[1, 0], points_m[2, 1] = -np.inf, np.inf
+    np.testing.assert_array_equal(fields.conform("points_m", points_m, "here"), points_m)
+    with pytest.raises(schema.DataError, match="depth_m has 1 of 2 values such as -inf"):
+        fields.conform("depth_m", np.array([[1.0, -np.inf], [np.inf, np.nan]], np.float32), "here")
+
+
+def test_a_link_to_nowhere_is_no_file(tmp_path):
+    (tmp_path / "000001.png").symlink_to(tmp_path / ".annex/missing")
+    (tmp_path / "000002.png").touch()
+    (tmp_path / "000003.png").symlink_to(tmp_path / "000002.png")
+    assert files.numbered(tmp_path, ".png") == {2: "000002.png", 3: "000003.png"}
+    assert files.names_in(tmp_path / "none") == []

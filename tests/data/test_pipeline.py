@@ -317,3 +317,14 @@ def test_motion_since_the_frame_before_is_made_of_poses():
     blind = dataclasses.replace(recording.description, modalities=frozenset({"speed_mps"}))
     with pytest.raises(schema.DataError, match=r"head 'ego_motion' learns from pose.* \(--heads=action\)"):
         fitting.check_targets(config, blind)
+
+
+@given(st.lists(st.integers(0, 3), min_size=1, max_size=12))
+def test_the_other_window_is_the_first_of_another_drive_from_half_the_list_on(drives):
+    found = tuple(windows.Window(schema.Sequence("train", f"train/{drive}", index, 5), 0, 2, 1)
+                  for index, drive in enumerate(drives))
+    count = len(found)
+    for index, other in enumerate(windows.others(found)):
+        places = [(index + count // 2 + step) % count for step in range(count)]
+        expected = next((place for place in places if drives[place] != drives[index]), places[0])
+        assert other is found[expected]

@@ -8,7 +8,7 @@ import pytest
 import recording_writers as writers
 
 from muvo_jax import config as config_lib
-from muvo_jax import presets
+from muvo_jax import evaluate, presets
 from muvo_jax.data import fitting, prepare, schema
 from muvo_jax.data.kitti import reader as kitti_reader
 from muvo_jax.data.plain import reader as plain_reader
@@ -69,6 +69,22 @@ def test_a_short_recording_gets_short_windows(kitti_recording):
     assert (data.stride, data.context, data.horizon, data.frames) == (1, 4, 4, 8)
     assert any("short recording" in note and "16 frames" in note for note in notes)
     assert fitting.adapt(config, kitti_recording).config == config
+
+
+def test_windows_of_a_trained_run_do_not_change_in_silence(kitti_recording):
+    run = config_lib.override_all(fitting.adapt(presets.get("town"), kitti_recording).config, {
+        "data.stride": 2, "data.context": 6})
+    with pytest.warns(schema.DataWarning, match=r"judged with stride=1 \(2\), context=4 \(6\), in brackets"):
+        evaluate.fit(run, kitti_recording, ())
+    with pytest.warns(schema.DataWarning, match="judged with stride=1"):  # also where its training split is not read
+        evaluate.fit(run, kitti_recording, (), splits=("val",))
+
+
+def test_windows_beyond_a_long_recording_are_refused(tmp_path):
+    recording = kitti_reader.KittiRecording(writers.write_kitti(tmp_path, frames=180))  # 120 frames train, 60 validate
+    run = config_lib.override(fitting.adapt(presets.get("town"), recording).config, "data.horizon", 40)
+    with pytest.raises(schema.DataError, match="60 frames, but a window of"):
+        evaluate.fit(run, recording, ("data.horizon",), splits=("val",))
 
 
 def test_what_the_user_chose_is_kept(kitti_recording):
@@ -163,6 +179,17 @@ def test_the_intrinsics_follow_the_image(tmp_path, kitti_recording):
     frame = prepare.prepare_frame(kitti_recording.read(kitti_recording.sequences[0], 0), config)
     assert frame["image"].shape == (64, 192, 3)
     np.testing.assert_allclose(frame["intrinsics"], [[105, 0, 96], [0, 105, 36 - 8], [0, 0, 1]], rtol=1e-6)
+
+
+@pytest.mark.parametrize(("chosen", "value"), [
+    ("contract.accel_full_mps2", 9.0), ("contract.wheelbase_m", 1.0), ("model.voxels.voxel_size_m", 0.7),
+    ("model.range_view.position_m", [0.0, 0.0, 9.0])])
+def test_what_a_recording_says_cannot_be_set_otherwise(plain_recording, chosen, value):
+    asked = config_lib.override(presets.tiny(), chosen, value)
+    with pytest.raises(schema.DataError, match=rf"{chosen}.* is set to .*, but recording .* says .*Leave the setting"):
+        fitting.adapt(asked, plain_recording, keep=(chosen,))
+    fitted = fitting.adapt(asked, plain_recording).config
+    assert fitting.adapt(fitted, plain_recording, keep=(chosen, "contract.step_action")).config == fitted
 
 
 def test_a_frame_that_does_not_fit_is_named(plain_recording):

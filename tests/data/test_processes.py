@@ -32,8 +32,9 @@ def test_an_error_keeps_its_type_and_words():
 
 
 def test_a_killed_worker_is_told():
-    with pytest.raises(RuntimeError, match="a halving process was killed"):
+    with pytest.raises(processes.WorkerError, match="a halving process was killed") as told:
         spread([99, 1])
+    assert isinstance(told.value, OSError) and isinstance(told.value, RuntimeError)  # commands expect the first
 
 
 def test_a_lock_refuses_or_waits(tmp_path):

@@ -9,7 +9,7 @@ import recording_writers as writers
 from PIL import Image
 
 from muvo_jax import voxelize as command
-from muvo_jax.data import fields, schema, voxelizing
+from muvo_jax.data import fields, processes, schema, voxelizing
 from muvo_jax.data.muvo import reader as muvo_reader
 from muvo_jax.data.muvo import runs as muvo_runs
 from muvo_jax.data.muvo import safe_pickle
@@ -109,6 +109,39 @@ def test_whole_files_are_kept_and_half_ones_made_again(recording):
     assert sorted(path.name for path in folder.iterdir()) == ["000000.npz", "000001.npz", "rule.json"]
 
 
+@pytest.mark.parametrize("rule", voxelizing.RULES)
+def test_occupancy_that_nobody_noted_a_rule_of_is_not_taken_for_ours(recording, rule):
+    folder = recording / "train/a/occupancy"
+    folder.mkdir()
+    np.savez(folder / "000000.npz", occupancy=np.zeros((8, 8, 4), np.uint8))
+    with pytest.raises(FileExistsError, match=r"000000\.npz: no rule\.json beside it .*--overwrite"):
+        voxelizing.voxelize(recording, rule=rule, workers=1)
+    assert voxelizing.voxelize(recording, rule=rule, overwrite=True, workers=1) == (4, 0)
+    assert occupancy(recording).shape == (16, 16, 16)
+
+
+POINT = np.array([[-3.5, 5.5, 0.5]])
+
+
+@pytest.mark.parametrize(("path", "arrays", "message"), [
+    ("lidar/000001.npz", {"points_m": (POINT * 1000).astype(np.int32)}, "points_m holds int32, expected float32 in m"),
+    ("lidar/000001.npz", {"points_m": POINT.astype(complex)}, "points_m holds complex128"),
+    ("lidar/000001.npz", {"points_m": POINT * 1e30}, "points_m has 3 of 3 values such as"),
+    ("lidar/000001.npz", {"points_m": np.zeros(3, "f4,f4,f4")}, r"shape \[3\] of points_m, expected \['any', 3\]"),
+    ("depth/000001.npz", {"depth_m": np.full((3, 3), 5000, np.uint16)}, "depth_m holds uint16, expected float32 in m"),
+    ("depth/000001.npz", {"depth_m": np.full((3, 3), -5.0)}, "depth_m has 9 of 9 values such as -5.0"),
+    ("depth/000001.npz", {"depth_m": np.full((3, 3), "5.0")}, "depth_m holds <U3"),
+    ("depth/000001.npz", {"depth_m": np.zeros((3, 3), "f4,f4")}, r"depth_m holds \[\('f0'"),
+])
+def test_measurements_that_the_reader_refuses_are_not_voxelized(recording, path, arrays, message):
+    (recording / "train/a/depth/000001.png").unlink()
+    np.savez(recording / "train/a/depth/000001.npz", depth_m=np.pad(np.float32([[4.0]]), 1))
+    np.savez(recording / "train/a" / path, **arrays)
+    with pytest.raises(schema.DataError, match=f"1 of 4 frames have no occupancy.*train/a/{path}: {message}"):
+        voxelizing.voxelize(recording, workers=1)
+    assert len(list(recording.glob("*/*/occupancy/*.npz"))) == 3
+
+
 def test_frames_that_cannot_be_made_are_named_and_the_others_done(recording):
     (recording / "train/a/depth/000001.png").write_bytes(b"no image")
     with pytest.raises(schema.DataError, match=r"1 of 4 frames have no occupancy.*000001\.png: not a readable image"):
@@ -189,3 +222,81 @@ def test_carved_occupancy_of_the_layout_is_read_in_place_of_its_voxels(layout):
     # Pixels are lifted half a pixel apart, so that hits at the borders of voxels differ.
     assert (ours == 1)[theirs == 1].mean() > 0.8
     assert (run / "voxel/voxel_000000011.npy").read_bytes() == before
+
+
+def without_row(table, row):
+    return {name: np.delete(cells, row, axis=0) if isinstance(cells, np.ndarray) else
+            [cell for index, cell in enumerate(cells) if index != row] for name, cells in table.items()}
+
+
+@needs_layout
+@pytest.mark.parametrize("rule", voxelizing.RULES)
+def test_frames_keep_their_occupancy_when_a_row_is_taken_out_of_the_table(layout, rule):
+    run = layout / "trainval/train/Town01/0000"
+    shutil.rmtree(run / "voxel")
+    table = safe_pickle.load_table(run / muvo_runs.FRAME_FILE)
+    (run / muvo_runs.FRAME_FILE).write_bytes(voxelizing.frame_pickle.frame(
+        {name: cells[:4] for name, cells in table.items() if name != "voxel_path"}))
+    assert voxelizing.voxelize(layout, rule=rule, workers=1) == (4, 0)
+    whole = muvo_reader.MuvoRecording(layout, skipped_s=0.0)
+    expected = whole.read(whole.sequences[0], 2)
+    rest = without_row(safe_pickle.load_table(run / muvo_runs.FRAME_FILE), 1)
+    (run / muvo_runs.FRAME_FILE).write_bytes(voxelizing.frame_pickle.frame(rest))
+    assert voxelizing.voxelize(layout, rule=rule, workers=1) == (0, 3)
+    with pytest.warns(schema.DataWarning, match="time jumps"):
+        opened = muvo_reader.MuvoRecording(layout, skipped_s=0.0)
+    frame = opened.read(opened.sequences[1], 0)
+    for name in ("image", "occupancy"):
+        np.testing.assert_array_equal(frame[name], expected[name])
+
+
+@needs_layout
+def test_voxels_of_the_layout_are_kept_by_their_form(layout):
+    run = layout / "trainval/train/Town01/0000"
+    table = safe_pickle.load_table(run / muvo_runs.FRAME_FILE)
+    (run / muvo_runs.FRAME_FILE).write_bytes(voxelizing.frame_pickle.frame(
+        {name: cells[:12] for name, cells in table.items()}))
+    theirs = run / "voxel/voxel_000000003.npy"
+    theirs.write_bytes(theirs.read_bytes()[:-8])  # an interrupted copy
+    assert voxelizing.voxelize(layout, rule="reference", workers=1) == (1, 11)
+    (run / "voxel/rule.json").unlink()
+    np.save(theirs, np.zeros((192, 192, 64), np.uint8))
+    with pytest.raises(FileExistsError, match=r"voxel_000000003\.npy: uint8 \[192, 192, 64\], .*--overwrite"):
+        voxelizing.voxelize(layout, rule="reference", workers=1)
+
+
+def test_the_sensors_of_the_recording_hold_for_any_folder_of_it(tmp_path):
+    from_root, header_path = tmp_path / "muvo", tmp_path / "muvo/sensors.toml"
+    (from_root / "trainval/val0/Town01").mkdir(parents=True)
+    header_path.write_text("[voxels]\nshape = [96, 96, 32]\nvoxel_size_m = 1.0\norigin_m = [-48.0, -48.0, -6.0]\n")
+    (from_root / "trainval/val0/Town01/0000").mkdir()
+    (from_root / "trainval/val0/Town01/0000/pd_dataframe.pkl").touch()
+    for folder in ("", "trainval", "trainval/val0", "trainval/val0/Town01", "trainval/val0/Town01/0000"):
+        header, path = muvo_reader.read_sensors(from_root / folder)
+        assert header["voxels"]["shape"] == [96, 96, 32] and path == header_path
+
+
+def test_occupancy_of_another_grid_is_not_read(recording):
+    voxelizing.voxelize(recording, workers=1)
+    path = recording / "recording.toml"
+    text = path.read_text()
+    assert "voxel_size_m = 1\n" in text
+    path.write_text(text.replace("voxel_size_m = 1\n", "voxel_size_m = 0.5\n"))
+    told = r"made for .*'voxel_size_m': 1\.0.* described with .*'voxel_size_m': 0\.5"
+    with pytest.raises(schema.DataError, match=told):
+        plain_reader.PlainRecording(recording)
+    path.write_text(text)
+    (recording / "train/a/occupancy/rule.json").write_bytes(b"\xff{")
+    with pytest.raises(schema.DataError, match=r"rule\.json: does not say by which rule and grid"):
+        plain_reader.PlainRecording(recording)
+    with pytest.raises(FileExistsError, match="--overwrite removes them"):
+        voxelizing.voxelize(recording, workers=1)
+    voxelizing.voxelize(recording, workers=1, overwrite=True)
+    assert plain_reader.PlainRecording(recording).sequences
+
+
+@pytest.mark.parametrize("held", ["..", "train", "train/a"])
+def test_who_works_on_a_part_or_the_whole_keeps_others_out(recording, held):
+    with (processes.locked((recording / held).resolve() / ".voxelizing", "voxelizing"),
+          pytest.raises(BlockingIOError, match="another process is voxelizing here now")):
+        voxelizing.voxelize(recording, workers=1)

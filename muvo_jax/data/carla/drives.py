@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 import pathlib
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -70,7 +71,14 @@ class CarlaDrive(NamedTuple):
 
 def plan(*, towns: Sequence[str] = TOWNS, train_runs: int = 25, val_runs: int = 5, run_s: float = RUN_S,
          rate_hz: float = muvo_reader.RATE_HZ, seed: int = 0) -> list[CarlaDrive]:
-    """The paper's runs: train, val_rl (same weathers) and val_ds (others), weathers drawn at random."""
+    """The paper's runs: train, val_rl (same weathers) and val_ds (others), weathers drawn at random.
+
+    Raises:
+      ValueError: where that is no run, or none with a frame.
+    """
+    if not towns or min(train_runs, val_runs) < 0 or not train_runs + val_runs or not 1 <= run_s * rate_hz < math.inf:
+        raise ValueError(f"{len(towns)} towns, {train_runs} runs to train, {val_runs} to validate, {run_s:g} s each: "
+                         f"expected a town, a run and a frame at least.")
     jobs = []
     runs_of, weathers_of = (train_runs, val_runs, val_runs), (WEATHERS, WEATHERS, SHIFTED_WEATHERS)
     for number, (split, runs, weathers) in enumerate(zip(SPLITS, runs_of, weathers_of, strict=True)):
@@ -101,6 +109,7 @@ class Estimate(NamedTuple):
 
 def estimate(out: pathlib.Path, jobs: Sequence[CarlaDrive], settings: Settings) -> Estimate:
     """See Estimate."""
+    out = out.expanduser()
     complete = [job for job in jobs if plain_writer.is_complete(out, job.split, job.run)]
     frames = sum(job.frames for job in jobs)
     missing = frames - sum(job.frames for job in complete)
@@ -109,7 +118,8 @@ def estimate(out: pathlib.Path, jobs: Sequence[CarlaDrive], settings: Settings) 
         folder = out / complete[0].split / complete[0].run
         written = [path.stat() for path in folder.rglob("*") if path.is_file()]
         times = [status.st_mtime for status in written]
-        rows = len((folder / plain_reader.FRAMES_FILE).read_text(encoding="utf-8").splitlines()) - 1
+        lines = (folder / plain_reader.FRAMES_FILE).read_text(encoding="utf-8").splitlines()
+        rows = max(len(lines) - 1, 1)
         frame_bytes = sum(status.st_size for status in written) / rows
         frame_s = (max(times) - min(times)) / rows
     return Estimate(frames, missing, missing * frame_bytes, missing * frame_s / 3600, bool(complete))

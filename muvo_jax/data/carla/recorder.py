@@ -61,6 +61,7 @@ def record(out: pathlib.Path, simulator: Simulator, jobs: Sequence[CarlaDrive], 
       CarlaError: where a sensor stalls, is blank or frozen, nothing is written, the disk is too small, or a drive
         fails ATTEMPTS times. The run in question stays incomplete and is recorded again next time.
     """
+    out = out.expanduser()
     _describe(out, settings)
     with processes.locked(out / ".recording", "recording"):
         _record_missing(out, simulator, jobs, settings, progress)

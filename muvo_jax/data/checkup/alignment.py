@@ -24,7 +24,7 @@ from muvo_jax.ops import range_view as range_view_ops
 _JUMP_RATIO, _JUMP_M = 1.15, 1.0
 _NEAREST_M, _FARTHEST_M = 3.0, 50.0
 _CLEARANCE_M, _GROUND_CELL_M = 0.6, 3.0  # what is lower, over the lowest point nearby, is ground
-_FARTHEST_M = 1000.0  # no lidar's; the ground is looked up in a table that such points would make too large
+_GROUND_FARTHEST_M = 1000.0  # no lidar's; the ground is looked up in a table that such points would make too large
 _BLUR_PX = 1.0
 SEARCH, _SEARCH_ROWS = 0.04, 2.5  # to each side: of the image width, but at least so many rows of the lidar,
 _MOST_SEARCHED = 0.2  # and no more of the image's shorter side
@@ -207,7 +207,7 @@ def _next_above(range_m: np.ndarray, direction: np.ndarray, row_rad: float) -> t
 
 def _clearance(view: np.ndarray) -> np.ndarray:
     """[rows, columns]: height of a pixel's point over the lowest within some metres, NaN where there is none."""
-    valid = (view[..., 3] > 0) & (np.abs(view[..., :2]) < _FARTHEST_M).all(axis=-1)
+    valid = (view[..., 3] > 0) & (np.abs(view[..., :2]) < _GROUND_FARTHEST_M).all(axis=-1)
     points_m = view[valid][:, :3]
     heights_m = np.full(view.shape[:2], np.nan)
     if not len(points_m):

@@ -18,6 +18,7 @@ _OXTS_COLUMNS, _SPEED, _ACCELERATION, _YAW_RATE = 30, 8, 14, 22
 _LATITUDE, _LONGITUDE, _YAW = 0, 1, 5  # degrees, degrees, rad (0 is east)
 _EARTH_RADIUS_M = 6378137.0
 _UNIT_TO_EGO_M = (0.81, -0.32)  # forward and left, from the GPS unit to the lidar (calib_imu_to_velo.txt)
+CALIBRATION = ("calib_cam_to_cam.txt", "calib_velo_to_cam.txt")
 # Columns of an oxts line that are used, and what they may be.
 _OXTS_LIMITS = {_LATITUDE: ("latitude", between(-90, 90, "degrees")), _LONGITUDE: ("longitude", between(-180, 180,
                 "degrees")), _YAW: ("yaw", between(-2 * math.pi, 2 * math.pi, "rad")),
@@ -26,15 +27,15 @@ _OXTS_LIMITS = {_LATITUDE: ("latitude", between(-90, 90, "degrees")), _LONGITUDE
                 _YAW_RATE: ("angular rate about the up axis", between(-20, 20, "rad/s"))}
 _REFLECTANCE_SHARE = 0.01  # more of it outside [0, 1] is no reflectance
 
+
 def read_scan(path: pathlib.Path) -> np.ndarray:
     """Returns one velodyne scan as points float32 [N, 3] in the ego frame (reflectance is not used).
 
     Raises:
-      DataError: for a missing or empty file, a size that is no multiple of 16 bytes, or more than 1 % NaN points.
+      DataError: for a missing, unreadable or empty file, a size that is no multiple of 16 bytes, or more than 1 % NaN
+        points.
     """
-    if not path.is_file():
-        raise files.missing(path, "a velodyne scan")
-    content = path.read_bytes()
+    content = files.read_bytes(path, "a velodyne scan")
     if not content or len(content) % 16:
         raise schema.DataError(f"{path}: {len(content)} bytes; a velodyne scan is a positive multiple of 16 bytes "
                                f"(float32 x, y, z, reflectance). The file is truncated or no scan: copy it again, or "
@@ -57,7 +58,7 @@ def read_oxts(path: pathlib.Path) -> tuple[float, float, float]:
     """Returns forward speed (m/s), forward acceleration (m/s2) and yaw rate (rad/s, left positive).
 
     Raises:
-      DataError: for a missing file or one that is not a line of 30 numbers.
+      DataError: for a missing or unreadable file or one that is not a line of 30 numbers.
     """
     values = _oxts_values(path)
     return values[_SPEED], values[_ACCELERATION], values[_YAW_RATE]
@@ -79,10 +80,9 @@ def read_pose(path: pathlib.Path, origin: pathlib.Path) -> np.ndarray:
 
 
 def _oxts_values(path: pathlib.Path) -> list[float]:
-    if not path.is_file():
-        raise files.missing(path, "the motion of the frame (oxts)")
+    content = files.read_bytes(path, "the motion of the frame (oxts)")  # its error is a ValueError, too
     try:
-        values = [float(word) for word in path.read_text(encoding="utf-8-sig").split()]
+        values = [float(word) for word in content.decode("utf-8-sig").split()]
     except ValueError as error:
         raise schema.DataError(f"{path}: not a line of numbers ({error}).") from error
     if len(values) < _OXTS_COLUMNS or not all(map(math.isfinite, values)):
@@ -104,9 +104,9 @@ def read_camera(date_folder: pathlib.Path, number: str) -> schema.Camera:
     Raises:
       DataError: where a calibration file or a key is missing.
     """
-    cameras = _read_calibration(date_folder / "calib_cam_to_cam.txt",
-                                {f"P_rect_{number}": 12, "R_rect_00": 9, f"S_rect_{number}": 2})
-    lidar = _read_calibration(date_folder / "calib_velo_to_cam.txt", {"R": 9, "T": 3})
+    of_cameras, of_lidar = (date_folder / name for name in CALIBRATION)
+    cameras = _read_calibration(of_cameras, {f"P_rect_{number}": 12, "R_rect_00": 9, f"S_rect_{number}": 2})
+    lidar = _read_calibration(of_lidar, {"R": 9, "T": 3})
     projection = cameras[f"P_rect_{number}"].reshape(3, 4)
     intrinsics = projection[:, :3]
     width_px, height_px = (round(side) for side in cameras[f"S_rect_{number}"])
@@ -118,13 +118,13 @@ def read_camera(date_folder: pathlib.Path, number: str) -> schema.Camera:
         camera_to_ego = lidar_to_ego @ np.linalg.inv(shift @ rectify @ lidar_to_camera0)
         return schema.Camera.of(width_px, height_px, intrinsics, camera_to_ego)
     except ValueError as error:
-        raise schema.DataError(f"{date_folder}: calib_cam_to_cam.txt and calib_velo_to_cam.txt make no camera: "
-                               f"{error}") from error
+        raise schema.DataError(f"{date_folder}: {' and '.join(CALIBRATION)} make no camera: {error}") from error
 
 
-def text_lines(path: pathlib.Path) -> list[str]:
+def text_lines(path: pathlib.Path, what: str) -> list[str]:
+    """The lines of a text file; raises DataError, which calls it `what`, where it is missing or unreadable."""
     try:
-        return path.read_text(encoding="utf-8-sig").splitlines()
+        return files.read_bytes(path, what).decode("utf-8-sig").splitlines()
     except UnicodeDecodeError as error:
         raise schema.DataError(f"{path}: not a text file ({error}). Unpack it again.") from error
 
@@ -134,9 +134,8 @@ def _rigid(rotation: np.ndarray, translation: np.ndarray) -> np.ndarray:
 
 
 def _read_calibration(path: pathlib.Path, sizes: dict[str, int]) -> dict[str, np.ndarray]:
-    if not path.is_file():
-        raise files.missing(path, "the calibration of this date (KITTI offers it as a separate download)")
-    lines = dict(line.split(":", 1) for line in text_lines(path) if ":" in line)
+    text = text_lines(path, "the calibration of this date (KITTI offers it as a separate download)")
+    lines = dict(line.split(":", 1) for line in text if ":" in line)
     values = {}
     for key, size in sizes.items():
         try:

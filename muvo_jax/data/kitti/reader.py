@@ -19,6 +19,7 @@ from __future__ import annotations
 import dataclasses
 import datetime
 import math
+import os
 import pathlib
 import re
 import warnings
@@ -28,7 +29,9 @@ import numpy as np
 
 from muvo_jax import config as config_lib
 from muvo_jax.data import ego_motion, files, schema, sequences
-from muvo_jax.data.kitti.files import LIDAR_HEIGHT_M, read_camera, read_oxts, read_pose, read_scan, text_lines
+from muvo_jax.data.kitti import files as kitti_files
+from muvo_jax.data.kitti.files import LIDAR_HEIGHT_M, read_camera, read_oxts, read_pose, read_scan
+from muvo_jax.limits import between
 
 __all__ = ["CAMERAS", "CONTRACT", "LIDAR", "LIDAR_HEIGHT_M", "KittiRecording", "find_drives", "read_camera",
            "read_oxts", "read_pose", "read_scan"]
@@ -50,11 +53,13 @@ _NOTE_ACTIONS = "KITTI: actions are derived from speed, acceleration and yaw rat
 CAMERAS = ("image_00", "image_01", "image_02", "image_03")
 _SUFFIXES = {"velodyne_points": (".bin",), "oxts": (".txt",)}
 _IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")
+_PERIOD_S = between(0.001, 10, "s")  # of drives that were thinned out, too
 _MOST_FRAMES = 1_000_000  # of a drive: time stamps stand on the line of a frame's number
 
 
 @dataclasses.dataclass(frozen=True)
 class _Drive:
+    name: str
     folder: pathlib.Path
     camera: schema.Camera | None
     frame_ids: np.ndarray  # int64 [F], every number from the first frame of any sensor to the last
@@ -71,7 +76,7 @@ class _Drive:
 
 def find_drives(path: pathlib.Path) -> list[pathlib.Path]:
     """The drive folders at `path`, in it, or in its date folders, sorted by name."""
-    if _DRIVE.fullmatch(path.resolve().name):
+    if _DRIVE.fullmatch(_name(path)):
         return [path]
     return sorted(found for pattern in ("*_sync", "*/*_sync") for found in path.glob(pattern)
                   if found.is_dir() and _DRIVE.fullmatch(found.name))
@@ -88,8 +93,8 @@ class KittiRecording:
           camera: one of CAMERAS.
 
         Raises:
-          DataError: where there is no drive, no drive has oxts and another sensor, or one lacks calibration or time
-            stamps; for a camera that KITTI does not have.
+          DataError: where there is no drive, two are of one name, no drive has oxts and another sensor, or one lacks
+            calibration or time stamps; for a camera that KITTI does not have.
         """
         path = pathlib.Path(path).expanduser()
         if camera not in CAMERAS:
@@ -110,7 +115,7 @@ class KittiRecording:
             raise _lacking(folders[0], self._sensors)
         for folder in sorted(set(folders) - set(whole)):
             warnings.warn(f"{_lacking(folder, self._sensors)} The drive is left out.", schema.DataWarning, stacklevel=2)
-        self._drives = {folder.resolve().name: _open_drive(folder, self._sensors) for folder in whole}
+        self._drives = {name: _open_drive(folder, self._sensors) for name, folder in _named(whole, path).items()}
         steps = np.concatenate([np.diff(drive.timestamps_s) for drive in self._drives.values()])
         period_s = float(np.nanmedian(steps)) if np.isfinite(steps).any() else 1.0 / CONTRACT.rate_hz
         rate_hz = round(1.0 / period_s, 1)
@@ -170,6 +175,40 @@ class KittiRecording:
         return ego_motion.derive_action(*motion, self.description.contract)
 
 
+def _name(folder: pathlib.Path) -> str:
+    """A drive's name: what the folder is called here; where that is no drive's name, what a link leads to."""
+    here = os.path.basename(os.path.abspath(folder))
+    return here if _DRIVE.fullmatch(here) else folder.resolve().name
+
+
+def _named(folders: list[pathlib.Path], path: pathlib.Path) -> dict[str, pathlib.Path]:
+    """Name -> folder; of a drive and a link to it the one beside which its calibration lies.
+
+    Raises:
+      DataError: where two folders are of one drive.
+    """
+    found: dict[str, pathlib.Path] = {}
+    for folder in folders:
+        name = _name(folder)
+        other = found.setdefault(name, folder)
+        if other.resolve() != folder.resolve():
+            raise schema.DataError(f"{path}: {other} and {folder} are both drive {name}. Take one of them away, or "
+                                   f"read the folders one by one.")
+        if not _has_calibration(_date_folder(other)):
+            found[name] = folder
+    return found
+
+
+def _has_calibration(date_folder: pathlib.Path) -> bool:
+    return any((date_folder / name).is_file() for name in kitti_files.CALIBRATION)
+
+
+def _date_folder(folder: pathlib.Path) -> pathlib.Path:
+    """Where the calibration of a drive lies: beside it, or only beside what a link leads to."""
+    beside, target = pathlib.Path(os.path.abspath(folder)).parent, folder.resolve().parent
+    return target if _has_calibration(target) and not _has_calibration(beside) else beside
+
+
 def _files(folder: pathlib.Path, sensor: str) -> dict[int, str]:
     """Frame number -> name of the files of a sensor.
 
@@ -220,8 +259,8 @@ def _open_drive(folder: pathlib.Path, sensors: tuple[str, ...]) -> _Drive:
         raise schema.DataError(f"{folder}: no frame number is there for all of {', '.join(sensors)}. The folders are "
                                f"of different parts of a drive: unpack it again.")
     first = next(iter(sensors))
-    camera = read_camera(folder.resolve().parent, first.rsplit("_", 1)[-1]) if first in CAMERAS else None
-    return _Drive(folder=folder, camera=camera, frame_ids=frame_ids, present=present,
+    camera = read_camera(_date_folder(folder), first.rsplit("_", 1)[-1]) if first in CAMERAS else None
+    return _Drive(name=_name(folder), folder=folder, camera=camera, frame_ids=frame_ids, present=present,
                   absent={sensor: len(frame_ids) - len(have) for sensor, have in numbers.items()},
                   timestamps_s=_read_timestamps(folder / first / "timestamps.txt", frame_ids, present),
                   names={sensor: {number: name for number, name in have.items() if name != _usual(sensor, number)}
@@ -230,9 +269,7 @@ def _open_drive(folder: pathlib.Path, sensors: tuple[str, ...]) -> _Drive:
 
 def _read_timestamps(path: pathlib.Path, frame_ids: np.ndarray, present: np.ndarray) -> np.ndarray:
     """Seconds of each frame, NaN where not present; line n of the file (from 0) is frame n."""
-    if not path.is_file():
-        raise files.missing(path, f"the time stamps of {path.parent.name}")
-    stamps = text_lines(path)
+    stamps = kitti_files.text_lines(path, f"the time stamps of {path.parent.name}")
     times_s = np.full(len(frame_ids), np.nan)
     for frame_id in frame_ids[present].tolist():
         try:
@@ -246,13 +283,18 @@ def _read_timestamps(path: pathlib.Path, frame_ids: np.ndarray, present: np.ndar
                                    f"2011-09-26 13:02:25.964000000; found {found}. Take the file of the original "
                                    f"drive.") from error
     sequences.check_increasing(times_s[present], [f"{path}, line {frame_id + 1}" for frame_id in frame_ids[present]])
+    steps_s = np.diff(times_s)  # NaN beside a missing frame
+    if np.isfinite(steps_s).any() and not _PERIOD_S.holds(period_s := float(np.nanmedian(steps_s))):
+        raise schema.DataError(f"{path}: frames are {period_s:g} s apart, expected {_PERIOD_S} (KITTI's are 0.1 s). "
+                               f"Take the file of the original drive.")
     return times_s
 
 
 def _cut(drive: _Drive, period_s: float) -> list[schema.Sequence]:
     """The gap-free sequences of a drive, split at two thirds; of one that tests what is listed. Warns of gaps."""
-    name = drive.folder.resolve().name
+    name = drive.name
     boundary = len(drive.present) * 2 // 3
+    sequences.warn_of_rate(name, drive.timestamps_s[drive.present], period_s)
     late = sequences.after_gap(drive.timestamps_s, period_s)
     used = drive.present
     if name in TEST:

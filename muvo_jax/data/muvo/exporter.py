@@ -2,7 +2,8 @@
 
     OUT/trainval/<mode>/<Town>/<run>/...    see files.py; one run for each gap-free sequence
     OUT/sensors.toml                        ours: where the sensors sit (the authors' code passes it over)
-    OUT/runs.csv                            mode, town, run, and the run of the source that it is
+    OUT/runs.csv                            mode, town, run, and what of the source it is (recording, run, first frame,
+                                            frames, and a fingerprint of the files that it was made of)
 
 The plain format knows no expert's policy, no satellite position and no bird's-eye view of other cars: those columns are
 zeros, as an autopilot leaves them, and the birdview is background throughout. The weather's name is that of frames.csv,
@@ -23,7 +24,7 @@ from collections.abc import Callable, Iterator
 import numpy as np
 from PIL import Image
 
-from muvo_jax.data import description, files, schema, sequences
+from muvo_jax.data import description, fields, files, fingerprints, schema, sequences
 from muvo_jax.data.muvo import files as muvo_files
 from muvo_jax.data.muvo import frame_pickle
 from muvo_jax.data.muvo import reader as muvo_reader
@@ -38,6 +39,8 @@ _LAYOUT_PX = 192
 _COMMAND_FOLLOW = 4
 _BACKGROUND = 1  # bit 0
 _NO_WEATHER = "ClearNoon"  # where none is recorded
+RUNS_FILE = "runs.csv"
+_COLUMNS = ("mode", "town", "run", "recording", "source", "first_frame", "frames", "fingerprint")
 _TOWN = re.compile(r"(Town\d+\w*?)(?:_|$)")
 _LABELS = frozenset({"depth_m", "image_classes", "point_classes"})
 _WEATHER = ("cloudiness", "fog_density", "fog_distance", "fog_falloff", "precipitation", "precipitation_deposits",
@@ -46,7 +49,7 @@ _WEATHER = ("cloudiness", "fog_density", "fog_distance", "fog_falloff", "precipi
 
 def export(source: pathlib.Path | str, out: pathlib.Path | str, *, town: str = "Town01",
            progress: Callable[[int, int], None] | None = None) -> int:
-    """Writes every sequence of a plain recording as a run of the MUVO layout; complete runs that are there are kept.
+    """Writes every sequence of a plain recording as a run of the MUVO layout; complete runs of it are kept.
 
     Args:
       source: a plain recording with image, depth, classes, points and route map.
@@ -59,13 +62,17 @@ def export(source: pathlib.Path | str, out: pathlib.Path | str, *, town: str = "
 
     Raises:
       DataError: where the source lacks what the authors' reader always opens, or a file is damaged.
-      FileExistsError: where `out` holds an export of other sensors.
+      FileExistsError: where `out` holds an export of other sensors or another recording, or of this one as it was
+        before its files were changed.
     """
     source, out = pathlib.Path(source).expanduser(), pathlib.Path(out).expanduser()
+    if not re.fullmatch(r"Town\w+", town):
+        raise ValueError(f"--town={town}: expected a name such as Town01; the authors' code looks for those.")
     recording = plain_reader.PlainRecording(source, labels=_LABELS)
     _check(recording, source)
     _describe(recording.description, out)
     runs = _plan(recording, town)
+    _keep_table(source, out, recording, runs)
     total, written = sum(sequence.length for _, sequence in runs), 0
     for folder, sequence in runs:
         target = out / muvo_runs.VERSION_FOLDER / folder
@@ -74,10 +81,6 @@ def export(source: pathlib.Path | str, out: pathlib.Path | str, *, town: str = "
                 written += 1
                 if progress is not None:
                     progress(written, total)
-    table = io.StringIO(newline="")
-    rows = [(*pathlib.PurePosixPath(folder).parts, sequence.name, sequence.start) for folder, sequence in runs]
-    csv.writer(table, lineterminator="\n").writerows([("mode", "town", "run", "source", "first_frame"), *rows])
-    files.write_atomically(out / "runs.csv", table.getvalue())
     return written
 
 
@@ -114,6 +117,53 @@ def _plan(recording: plain_reader.PlainRecording, town: str) -> list[tuple[str, 
         counts[folder] += 1
         plan.append((f"{folder}/{number:04d}", sequence))
     return plan
+
+
+def _keep_table(source: pathlib.Path, out: pathlib.Path, recording: plain_reader.PlainRecording,
+                runs: list[tuple[str, schema.Sequence]]) -> None:
+    """Writes runs.csv, before any run; complete runs that are there must be those that it names.
+
+    Raises:
+      FileExistsError: where one is of something else.
+    """
+    path = out / RUNS_FILE
+    states = {name: _state(source, name) for name in {sequence.name for _, sequence in runs}}
+    rows = [[*pathlib.PurePosixPath(folder).parts, recording.description.name, sequence.name, str(sequence.start),
+             str(sequence.length), states[sequence.name]] for folder, sequence in runs]
+    before = _rows_of(path)
+    for complete in sorted((out / muvo_runs.VERSION_FOLDER).glob(f"*/*/*/{muvo_runs.FRAME_FILE}")):
+        place = complete.parent.parts[-3:]
+        old, new = (next((row for row in table if tuple(row[:3]) == place), []) for table in (before, rows))
+        if old != new:
+            raise FileExistsError(f"{complete.parent} was made of "
+                                  f"{_told(old, f'something that {RUNS_FILE} does not say')}, but would now be "
+                                  f"{_told(new, 'no run of this recording')} ({source}). Choose another folder, or "
+                                  f"remove {out} to export anew.")
+    table = io.StringIO(newline="")
+    csv.writer(table, lineterminator="\n").writerows([_COLUMNS, *rows])
+    files.write_atomically(path, table.getvalue())
+
+
+def _state(source: pathlib.Path, run: str) -> str:
+    """The fingerprint of what a run is made of; not of the whole source, in which the export may lie."""
+    described = fingerprints.of_files(source, [source / plain_reader.DESCRIPTION_FILE])
+    return fingerprints.combined([described, fingerprints.of_runs(source / run, [run])[run]])
+
+
+def _rows_of(path: pathlib.Path) -> list[list[str]]:
+    """Those of a runs.csv; none where there is none, or it is damaged."""
+    try:
+        return list(csv.reader(io.StringIO(path.read_text(encoding="utf-8"))))[1:]
+    except (FileNotFoundError, UnicodeDecodeError, csv.Error):
+        return []
+
+
+def _told(row: list[str], nothing: str) -> str:
+    """What a row of runs.csv says of its source."""
+    if len(row) != len(_COLUMNS):
+        return nothing
+    *_, recording, run, first, frames, fingerprint = row
+    return f"{frames} frames from {first} on of {run} of {recording}, whose files have the fingerprint {fingerprint}"
 
 
 def _write_run(recording: plain_reader.PlainRecording, sequence: schema.Sequence,
@@ -184,6 +234,7 @@ def _layout_tags(recording: plain_reader.PlainRecording) -> np.ndarray:
         tags[:len(names)] = [known.get(name, _OTHER_TAG) for name in names]
     elif recording.description.name == "town":
         tags[:len(TOWN_TAGS)] = TOWN_TAGS
+    tags[fields.UNKNOWN] = 0  # unlabelled; the authors' reader knows no tag beyond 22
     return tags
 
 

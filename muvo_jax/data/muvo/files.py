@@ -38,7 +38,7 @@ UNKNOWN_TAG = 255
 CLASSES = ("none", "building", "fence", "other", "pedestrian", "pole", "road line", "road", "sidewalk", "vegetation",
            "vehicle", "wall", "traffic sign", "sky", "ground", "bridge", "rail", "guard rail", "traffic light",
            "static", "dynamic", "water", "terrain")
-BIRDVIEW_CELL_M = 0.2
+BIRDVIEW_PX, BIRDVIEW_CELL_M = 192, 0.2
 BIRDVIEW_BEHIND_PX = 32  # rows below the ego, which looks up and stands in the middle column
 # What CARLA's tags from 0.9.14 on (the index) are in the layout's tags, those of 0.9.13; the rest is unlabelled.
 LAYOUT_TAGS = np.zeros(256, np.uint8)
@@ -63,13 +63,20 @@ def is_occupied(tags: np.ndarray) -> np.ndarray:
     return (tags != UNLABELLED) & (tags != SKY) & (tags != UNKNOWN_TAG)
 
 
-def read_depth_semantic(path: pathlib.Path) -> tuple[np.ndarray, np.ndarray]:
+def read_depth_semantic(path: pathlib.Path, size: tuple[int, int] | None = None) -> tuple[np.ndarray, np.ndarray]:
     """Returns the depth along the optical axis, float64 [H, W] in [0, 1] (1 is 1000 m: sky), and tags, uint8 [H, W].
 
+    Args:
+      size: (H, W) of the camera's images; any where it is not known.
+
     Raises:
-      DataError: where the file is missing, damaged or has no four channels.
+      DataError: where the file is missing, damaged, has no four channels or another size.
     """
     pixels = _read(path, (None, None, 4))
+    if size is not None and pixels.shape[:2] != size:
+        raise schema.DataError(f"{path}: {pixels.shape[1]}x{pixels.shape[0]} pixels, but the camera's images have "
+                               f"{size[1]}x{size[0]}; depth and classes must be those of the image. Record them with "
+                               f"one size and field of view.")
     return decode_depth(pixels[..., :3]), pixels[..., 3]
 
 
@@ -87,17 +94,18 @@ def encode_depth(depth_m: np.ndarray) -> np.ndarray:
 
 
 def read_birdview(path: pathlib.Path) -> np.ndarray:
-    """Returns the bit field, uint16 [rows, columns]; bit k is BIRDVIEW_BITS[k].
+    """Returns the bit field, uint16 [BIRDVIEW_PX, BIRDVIEW_PX]; bit k is BIRDVIEW_BITS[k].
 
     Raises:
-      DataError: where the file is missing, damaged or no grey image of whole numbers.
+      DataError: where the file is missing, damaged or no grey image of whole numbers and this size.
     """
-    pixels = _read(path, (None, None))
+    pixels = _read(path, (BIRDVIEW_PX, BIRDVIEW_PX))
     return pixels.astype(np.uint16)  # Pillow says int32 or uint16, depending on its version
 
 
 def read_labels(paths: Mapping[str, pathlib.Path], grid: config_lib.VoxelGrid,
-                translate: Callable[[np.ndarray, pathlib.Path], np.ndarray] | None = None) -> schema.RawFrame:
+                translate: Callable[[np.ndarray, pathlib.Path], np.ndarray] | None = None,
+                image_size: tuple[int, int] | None = None) -> schema.RawFrame:
     """The labels whose files are given: depth_m, image_classes, image_instance_mask and those of the bird's eye.
 
     The bird's-eye picture is looked up at the middle of each cell of the grid's ground plan: class 255 outside of it.
@@ -106,14 +114,15 @@ def read_labels(paths: Mapping[str, pathlib.Path], grid: config_lib.VoxelGrid,
       paths: of the files, by label.
       grid: its ground plan.
       translate: (tags, file) -> the layout's tags; by default they are the layout's.
+      image_size: (H, W) of the camera's images, where there are any.
 
     Raises:
-      DataError: where a file is missing or damaged.
+      DataError: where a file is missing, damaged or of another size.
     """
     frame: schema.RawFrame = {}
     camera = [paths[key] for key in ("depth_m", "image_classes", "image_instance_mask") if key in paths]
     if camera:  # one file
-        share, tags = read_depth_semantic(camera[0])
+        share, tags = read_depth_semantic(camera[0], image_size)
         frame["depth_m"] = np.where(share < 1.0, share * DEPTH_RANGE_M, np.inf).astype(np.float32)
         frame["image_classes"] = known_classes(translate(tags, camera[0]) if translate else tags)
         frame["image_instance_mask"] = schema.instance_mask(frame["image_classes"], CLASSES)
@@ -159,7 +168,7 @@ def read_points(path: pathlib.Path, lidar_position_m: tuple[float, float, float]
 
     Raises:
       Refused: where the pickled dict asks for more than arrays.
-      DataError: where the file is missing, damaged or holds no points.
+      DataError: where the file is missing, damaged or holds no points, or tags beyond 255.
     """
     content = safe_pickle.load_npy(path)
     points_m = content.get("points_xyz") if isinstance(content, dict) else None
@@ -170,6 +179,9 @@ def read_points(path: pathlib.Path, lidar_position_m: tuple[float, float, float]
     if tags is not None and not (isinstance(tags, np.ndarray) and tags.dtype.kind == "u" and
                                  tags.shape == points_m.shape[:1]):
         raise schema.DataError(f"{path}: ObjTag is no array of {len(points_m)} unsigned numbers.")
+    if tags is not None and tags.size and tags.max() > UNKNOWN_TAG:
+        raise schema.DataError(f"{path}: ObjTag has {tags.max()}, expected CARLA's semantic tags, 0 to {UNKNOWN_TAG}. "
+                               f"Write the tag of what each point hit, not the number of the object (ObjIdx).")
     finite = np.isfinite(points_m).all(axis=1)
     files.finite_points(points_m, path)
     ego_m = to_ego_frame(points_m, lidar_position_m)
@@ -221,5 +233,6 @@ def _read(path: pathlib.Path, shape: tuple[int | None, ...]) -> np.ndarray:
     fits = len(shape) == pixels.ndim and all(map(lambda want, side: want in (None, side), shape, pixels.shape))
     if not fits or pixels.dtype.kind not in "ui":
         raise schema.DataError(f"{path}: an image {list(pixels.shape)} of {pixels.dtype}, expected "
-                               f"{['any' if side is None else side for side in shape]} of whole numbers.")
+                               f"{['any' if side is None else side for side in shape]} of whole numbers. Write it "
+                               f"as the authors' DataWriter does.")
     return pixels

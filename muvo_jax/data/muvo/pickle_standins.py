@@ -373,7 +373,8 @@ def plain(value: Any, where: str, done: dict[int, Any] | None = None, depth: int
         done[id(value)] = made = [plain(item, where, done, depth + 1) for item in _items(value)]
         return made
     if isinstance(value, dict):
-        return {key: plain(item, where, done, depth + 1) for key, item in value.items()}
+        done[id(value)] = by_key = {key: plain(item, where, done, depth + 1) for key, item in value.items()}
+        return by_key
     if isinstance(value, StandIn) or callable(value):
         raise Refused(f"{where}: holds {kind(value)} among its values. {HOW_TO_GO_ON}")
     return value

@@ -20,6 +20,7 @@ from __future__ import annotations
 import dataclasses
 import math
 import pathlib
+import warnings
 from collections.abc import Collection
 
 import numpy as np
@@ -43,7 +44,6 @@ VOXELS = config_lib.VoxelGrid()
 ROUTE_MAP = config_lib.RouteMap(metres_per_px=0.6, ego_row=160 / 3, ego_column=32.0)  # every third pixel of theirs
 CONTRACT = config_lib.ActionContract(kinematics="none", source="recorded", rate_hz=RATE_HZ)
 _ROUTE_PX = 64
-_TAGGED_RUNS = 3  # looked at for their tags, about
 # RawFrame key -> kind of file.
 _FILES = {"image": "image", "points_m": "points_semantic", "occupancy": "voxel", "route_map": "routemap"}
 _LABEL_FILES = {"depth_m": "depth_semantic", "image_classes": "depth_semantic",
@@ -65,14 +65,14 @@ class MuvoRecording:
 
         Raises:
           Refused: for a data frame that asks for more than data.
-          DataError: where there is no run, none is good enough, or a data frame lacks what is needed.
+          DataError: where there is no run, two have one name, none is good enough, or a data frame lacks what is
+            needed.
         """
         path = pathlib.Path(path).expanduser()
-        sensors_path = _sensors_path(path)
-        header = files.read_toml(sensors_path) if sensors_path.is_file() else {}
-        description.check_names(header, sensors_path, ("rate_hz", "tags"))
+        header, sensors_path = read_sensors(path)
         rate_hz = description.rate_hz(header, sensors_path) if "rate_hz" in header else RATE_HZ
         every = muvo_runs.find_runs(path)
+        _check_names(every, path)
         kept = [run for run in every if run.frames and not run.mean_reward < min_mean_reward]
         if not kept:
             raise schema.DataError(f"{path}: none of its {len(every)} runs has frames and a mean reward of "
@@ -89,6 +89,9 @@ class MuvoRecording:
                                          for run in kept], str(path))
         self._runs = {run.name: run for run in kept}
         self._columns = {run.name: _columns(run, rate_hz, "rate_hz" in header) for run in kept}
+        _warn_of_steps(kept)
+        for run in kept:
+            muvo_runs.check_numbers(run, [kind for key, kind in kinds.items() if key in modalities])
         self.sequences = tuple(sequence for run in kept
                                for sequence in self._cut(run, modalities, lacks[run.name], skipped_s, rate_hz))
         present = {sequence.split for sequence in self.sequences}
@@ -105,6 +108,9 @@ class MuvoRecording:
             route_map=(section("route_map") or ROUTE_MAP) if "route_map" in modalities else None,
             contract=description.contract(header, sensors_path, rate_hz)
             or dataclasses.replace(CONTRACT, rate_hz=rate_hz))
+        if (voxels := self.description.voxels) is not None:
+            for run in kept:
+                description.check_rule(run.folder / kinds["occupancy"], voxels)
         self._tags = muvo_tags.described(header, sensors_path) or self._recognised_tags(kept, path)
 
     def run(self, name: str) -> muvo_runs.Run:
@@ -143,7 +149,8 @@ class MuvoRecording:
                                   muvo_files.read_voxels(paths["occupancy"], described.voxels, self._translate))
         if "route_map" in paths:
             frame["route_map"] = _nearest(muvo_files.read_route_map(paths["route_map"]), _ROUTE_PX)
-        return frame | muvo_files.read_labels(paths, described.voxels or VOXELS, self._translate)
+        image_size = (described.camera.height_px, described.camera.width_px) if described.camera is not None else None
+        return frame | muvo_files.read_labels(paths, described.voxels or VOXELS, self._translate, image_size)
 
     def action(self, sequence: schema.Sequence, index: int) -> np.ndarray:
         """See schema.Recording."""
@@ -188,28 +195,58 @@ class MuvoRecording:
     def _recognised_tags(self, kept: list[muvo_runs.Run], path: pathlib.Path) -> muvo_tags.TagSet | None:
         """The tag set by what some files hold; None where nothing read needs one, or occupancy alone does.
 
+        One run of each mode and town is looked at.
+
         Raises:
-          DataError: where classes are wanted and the tags do not tell.
+          DataError: where classes are wanted and the tags do not tell, or those of two runs are of two sets.
         """
         wanted = self.description.modalities & {"image_classes", "image_instance_mask", "point_classes"}
         if not wanted and (self._is_carved or "occupancy" not in self.description.modalities):
             return None
-        every, ground = [], []
-        for run in kept[:: max(len(kept) // _TAGGED_RUNS, 1)]:
-            for row in {run.frames // 4, run.frames // 2}:
-                found = muvo_tags.of_frame(run, row)
-                every += found.every
-                ground += found.ground
-        tag_set = muvo_tags.recognise(every, ground, str(path))
+        every: list[np.ndarray] = []
+        ground: list[np.ndarray] = []
+        told: dict[muvo_tags.TagSet, str] = {}  # by which run first
+        for run in {run.name.rpartition("/")[0]: run for run in kept}.values():
+            frames = [muvo_tags.of_frame(run, row) for row in {run.frames // 4, run.frames // 2}]
+            of_run = [tags for frame in frames for tags in frame.every]
+            below = [tags for frame in frames for tags in frame.ground]
+            every, ground = every + of_run, ground + below
+            if (found := muvo_tags.recognise(of_run, below, str(run.folder))) is not None:
+                told.setdefault(found, run.name)
+        if len(told) > 1:
+            raise schema.DataError(f"{path}: run {told[muvo_tags.OLDER]} has the semantic tags of CARLA up to 0.9.13, "
+                                   f"{told[muvo_tags.NEWER]} those of 0.9.14 and later, which number classes "
+                                   f"otherwise. Make two recordings of them, each with its tags in {SENSORS_FILE}.")
+        tag_set = next(iter(told), None) or muvo_tags.recognise(every, ground, str(path))
         if tag_set is None and wanted:
             raise muvo_tags.undecided(str(path))
         return tag_set
 
 
-def _sensors_path(path: pathlib.Path) -> pathlib.Path:
-    """sensors.toml in this folder of the layout or the nearest one above it, up to the recording's root."""
+def read_sensors(path: pathlib.Path) -> tuple[dict, pathlib.Path]:
+    """sensors.toml in this folder of the layout or the nearest one above it, up to the recording's root, and where.
+
+    Empty where there is none.
+
+    Raises:
+      DataError: where it is malformed or has entries that are unknown.
+    """
     above = [path.resolve(), *path.resolve().parents][:muvo_runs.root_levels(path) + 1]
-    return next((folder / SENSORS_FILE for folder in above if (folder / SENSORS_FILE).is_file()), path / SENSORS_FILE)
+    found = next((folder / SENSORS_FILE for folder in above if (folder / SENSORS_FILE).is_file()), None)
+    header = files.read_toml(found) if found is not None else {}
+    found = found or path / SENSORS_FILE
+    description.check_names(header, found, ("rate_hz", "tags"))
+    return header, found
+
+
+def _check_names(every: list[muvo_runs.Run], path: pathlib.Path) -> None:
+    """Raises DataError where two runs have one name, such as those of two recordings in one folder."""
+    folders: dict[str, pathlib.Path] = {}
+    for run in every:
+        other = folders.setdefault(run.name, run.folder)
+        if other != run.folder:
+            raise schema.DataError(f"{path}: {other} and {run.folder} are both run {run.name}. Read the recordings one "
+                                   f"by one, or rename one of the folders.")
 
 
 def _is_carved(kept: list[muvo_runs.Run]) -> bool:
@@ -226,15 +263,13 @@ def _columns(run: muvo_runs.Run, rate_hz: float, is_stated: bool) -> dict[str, n
         is stated.
     """
     where = str(run.folder / muvo_runs.FRAME_FILE)
-    numbers = muvo_runs.numbering(run)
-    steps, counts = np.unique(np.diff(numbers), return_counts=True)
-    step = int(steps[np.argmax(counts)]) if steps.size else 1
+    numbers, step = muvo_runs.numbering(run), _step(run)
     if step != 1 and not is_stated:
         raise schema.DataError(f"{where}: frames are numbered in steps of {step}. If {step - 1} of {step} were taken "
                                f"out, say rate_hz = {RATE_HZ / step:g} in {SENSORS_FILE}.")
     columns = {"action": muvo_runs.actions(run), "speed_mps": run.numbers("speed", 1)[:, 0],
                "reward": np.clip(run.numbers("reward", 1)[:, 0], -1.0, 1.0),
-               "is_terminal": np.zeros(run.frames, bool), "frame_id": np.arange(run.frames),
+               "is_terminal": np.zeros(run.frames, bool), "frame_id": numbers,
                "timestamp_s": (numbers - numbers[0]) / (step * rate_hz)}
     if "imu" in run.columns:
         columns["yaw_rate_radps"] = muvo_runs.yaw_rates(run)
@@ -245,13 +280,32 @@ def _columns(run: muvo_runs.Run, rate_hz: float, is_stated: bool) -> dict[str, n
     return columns
 
 
-def occupancy_name(row: int) -> str:
-    """Path of a frame's occupancy, relative to the run."""
-    return f"{OCCUPANCY_FOLDER}/{OCCUPANCY_FOLDER}_{row:09d}.npz"
+def _step(run: muvo_runs.Run) -> int:
+    """By how much the numbers of a run's frames mostly increase."""
+    steps, counts = np.unique(np.diff(muvo_runs.numbering(run)), return_counts=True)
+    return int(steps[np.argmax(counts)]) if steps.size else 1
+
+
+def _warn_of_steps(kept: list[muvo_runs.Run]) -> None:
+    """Warns where frames of some runs are numbered in other steps: one rate cannot hold for both."""
+    named: dict[int, str] = {}
+    for run in kept:
+        if run.frames > 2:
+            named.setdefault(_step(run), run.name)
+    if len(named) > 1:
+        told = " and ".join(f"in steps of {step} in {name}" for step, name in sorted(named.items()))
+        warnings.warn(f"frames are numbered {told}, yet one rate holds for all: speeds and actions would count for "
+                      f"another time. Keep runs of another rate in a recording of their own.", schema.DataWarning,
+                      stacklevel=3)
+
+
+def occupancy_names(run: muvo_runs.Run) -> muvo_runs.NumberedNames:
+    """Paths of the frames' occupancy, relative to the run; by their numbers, since rows may be taken out later."""
+    return muvo_runs.NumberedNames(f"{OCCUPANCY_FOLDER}/{OCCUPANCY_FOLDER}_", muvo_runs.numbering(run), 9, ".npz")
 
 
 def _with_occupancy(run: muvo_runs.Run) -> muvo_runs.Run:
-    names = muvo_runs.NumberedNames(f"{OCCUPANCY_FOLDER}/{OCCUPANCY_FOLDER}_", np.arange(run.frames), 9, ".npz")
+    names = occupancy_names(run)
     return dataclasses.replace(run, columns=run.columns | {f"{OCCUPANCY_FOLDER}_path": names})
 
 

@@ -8,21 +8,25 @@ import os
 import pathlib
 import re
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
+from typing import Any
 
 import numpy as np
 
 from muvo_jax.data import files, schema
 from muvo_jax.data.muvo import safe_pickle
+from muvo_jax.limits import between
 
 FRAME_FILE = "pd_dataframe.pkl"
 VERSION_FOLDER = "trainval"
+MOST_LEVELS = 4  # from a run's folder up to the recording's root
 _NUMBER = re.compile(r"(\d{1,18})$")
 _NUMBERED = re.compile(r"(.*?)(\d{1,18})((?:\.[a-zA-Z]+)?)", re.DOTALL)
 _PICTURES = (".png", ".jpg", ".jpeg")
 _MODES = ("train", "val0", "val1", "val2")
 # Columns that are kept beside the paths of files; a table has three times as many, most of it the expert's features.
 _KEPT = ("action", "speed", "reward", "imu", "value", "n_classes")
+_PEDAL = between(-0.001, 1.001)  # a little beyond 0 and 1 is rounding
 
 
 class NumberedNames(Sequence[str]):
@@ -93,19 +97,21 @@ class Run:
         """A column whose cells are arrays of `size` numbers (or numbers, for 1), float32 [frames, size].
 
         Raises:
-          DataError: where it is missing or a cell is of another size or not finite.
+          DataError: where it is missing, a cell is of another size or type, or a number is not finite.
         """
         path = self.folder / FRAME_FILE
         if column not in self.columns:
             raise schema.DataError(f"{path}: column {column!r} is missing; there are {', '.join(self.columns)}.")
         cells = self.columns[column]
         try:
-            if isinstance(cells, np.ndarray):  # cells of one size
-                values = cells.astype(np.float32).reshape(len(cells), size)
-            else:
-                values = np.array([np.reshape(cell, size) for cell in cells], np.float32).reshape(len(cells), size)
+            same = isinstance(cells, np.ndarray)  # cells of one size
+            found = np.asarray(cells if same else [_of_cell(cell, size) for cell in cells]).reshape(len(cells), size)
+            if found.dtype.kind not in "fiu":
+                raise ValueError(f"found {found.dtype}")
         except (TypeError, ValueError) as error:
-            raise schema.DataError(f"{path}: column {column!r} does not hold {size} numbers a frame.") from error
+            raise schema.DataError(f"{path}: column {column!r} does not hold {size} real numbers a frame ({error}). "
+                                   f"Write them as the authors' DataWriter does.") from error
+        values = found.astype(np.float32)
         if not np.isfinite(values).all():
             row = int(np.argmin(np.isfinite(values).all(axis=1)))
             raise schema.DataError(f"{path}, row {row}: {column} is not finite.")
@@ -120,9 +126,25 @@ class Run:
         relative = self.columns[f"{kind}_path"][row]
         parts = pathlib.PurePosixPath(_with_slashes(relative)).parts if isinstance(relative, str) else ()
         if not parts or ".." in parts or parts[0] == "/" or "\0" in relative:
-            raise schema.DataError(f"{self.folder / FRAME_FILE}, row {row}: {kind}_path is {str(relative)[:80]!r}, "
-                                   f"expected a path inside the run's folder.")
+            found = repr(relative[:80]) if isinstance(relative, str) else f"a {type(relative).__name__}"
+            raise schema.DataError(f"{self.folder / FRAME_FILE}, row {row}: {kind}_path is {found}, expected a path "
+                                   f"inside the run's folder.")
         return self.folder.joinpath(*parts)
+
+
+def _of_cell(cell: Any, size: int) -> np.ndarray:
+    """The numbers of a cell that is an array, a number or a list of numbers.
+
+    Lists in lists are refused before NumPy sees them: a pickle that refers to one list again and again is small, and
+    its array fills the memory.
+
+    Raises:
+      ValueError: for another size or something else.
+    """
+    if isinstance(cell, (list, tuple)) and not (
+            len(cell) <= size and all(isinstance(item, (int, float, np.number)) for item in cell)):
+        raise ValueError(f"found a list of {len(cell)}")
+    return np.reshape(cell, size)
 
 
 def _with_slashes(relative: str) -> str:
@@ -175,7 +197,7 @@ class _Folder:
     """The files of a folder; none where there is no folder."""
 
     def __init__(self, path: pathlib.Path):
-        self.names = {name for name in os.listdir(path) if not name.startswith(".")} if path.is_dir() else set()
+        self.names = {name for name in files.names_in(path) if not name.startswith(".")}
 
     @functools.cached_property
     def _by_stem(self) -> dict[str, dict[str, str]]:
@@ -211,12 +233,34 @@ def numbering(run: Run) -> np.ndarray:
     return np.arange(run.frames)
 
 
-def _increasing(numbers: np.ndarray, run: Run) -> np.ndarray:
+def check_numbers(run: Run, kinds: Collection[str]) -> None:
+    """Looks whether a row names files of one frame, by their numbers.
+
+    Files of two kinds that are numbered otherwise are warned of: rows may have been joined wrongly.
+
+    Raises:
+      DataError: where the numbers of a kind do not increase.
+    """
+    numbers, first = numbering(run), next((column for column in run.columns if column.endswith("_path")), "")
+    for kind in sorted(set(kinds)):
+        names = run.columns.get(f"{kind}_path")
+        if not isinstance(names, NumberedNames):
+            continue
+        wrong = np.flatnonzero(_increasing(names.numbers, run, f"{kind}_path") != numbers)
+        if wrong.size:
+            row = int(wrong[0])
+            warnings.warn(f"{run.folder / FRAME_FILE}: {wrong.size} of {run.frames} rows name files of two numbers, "
+                          f"such as row {row}: {kind}_path is number {names.numbers[row]}, {first} {numbers[row]}. "
+                          f"Were rows joined wrongly?", schema.DataWarning, stacklevel=4)
+
+
+def _increasing(numbers: np.ndarray, run: Run, column: str = "") -> np.ndarray:
     wrong = np.flatnonzero(np.diff(numbers) <= 0)
     if wrong.size:
         row = int(wrong[0]) + 1
-        raise schema.DataError(f"{run.folder / FRAME_FILE}, row {row}: frame {numbers[row]} comes after frame "
-                               f"{numbers[row - 1]}; rows must be in the order of their recording. Sort the table.")
+        where = f"{run.folder / FRAME_FILE}, row {row}{column and f' of {column}'}"
+        raise schema.DataError(f"{where}: frame {numbers[row]} comes after frame {numbers[row - 1]}; rows must be in "
+                               f"the order of their recording. Sort the table.")
     return numbers
 
 
@@ -232,16 +276,15 @@ def folders(path: pathlib.Path) -> list[tuple[str, pathlib.Path]]:
     """(split, folder) of every run below a root, version, mode, town or run folder; complete or not, sorted."""
     if (path / FRAME_FILE).is_file():
         return [("train", path)]
-    for depth in (1, 2, 3, 4):
-        pattern = "/".join("*" * depth)
-        found = sorted(frame.parent for frame in path.glob(f"{pattern}/{FRAME_FILE}"))
-        if not found:
-            continue
-        if depth == 4 and (path / VERSION_FOLDER).is_dir():
-            found = [folder for folder in found if folder.is_relative_to(path / VERSION_FOLDER)]
-        parents = {folder.parent for folder in found}
-        beside = sorted(child for parent in parents for child in parent.iterdir() if child.is_dir())
-        return [(_split(path, folder, depth), folder) for folder in beside]
+    seen = lambda folder: not any(part.startswith(".") for part in folder.relative_to(path).parts)
+    # What lies beside the version's folder, such as a backup, is no part of it.
+    for pattern, depth in ((f"{VERSION_FOLDER}/*/*/*", 4), ("*", 1), ("*/*", 2), ("*/*/*", 3), ("*/*/*/*", 4)):
+        found = sorted(frame.parent for frame in path.glob(f"{pattern}/{FRAME_FILE}") if seen(frame.parent))
+        if found:
+            parents = {folder.parent for folder in found}
+            beside = sorted(child for parent in parents for child in parent.iterdir()
+                            if child.is_dir() and not child.name.startswith("."))
+            return [(_split(path, folder, depth), folder) for folder in beside]
     return []
 
 
@@ -266,8 +309,11 @@ def find_runs(path: pathlib.Path) -> list[Run]:
 
 
 def _split(path: pathlib.Path, folder: pathlib.Path, depth: int) -> str:
-    mode = folder.parents[1].name if depth >= 3 else path.resolve().name
-    return mode if depth >= 3 or mode in _MODES else "train"
+    if depth >= 3:
+        return folder.parents[1].name
+    # A link to a mode's folder may be named after the mode, or lead to it.
+    names = (os.path.basename(os.path.abspath(path)), path.resolve().name)
+    return next((name for name in names if name in _MODES), "train")
 
 
 def _read_run(split: str, folder: pathlib.Path) -> Run:
@@ -279,8 +325,9 @@ def _read_run(split: str, folder: pathlib.Path) -> Run:
                                f"{', '.join(columns) or 'none'}.")
     kept = {name: (NumberedNames.of(cells) or cells) if name.endswith("_path") else cells
             for name, cells in columns.items() if name in _KEPT or name.endswith("_path")}
-    town = folder.resolve().parent.name
-    run = Run(split, f"{split}/{town}/{folder.resolve().name}", folder, kept)
+    # As the folder is called here: what a link leads to may bear the name of another run.
+    here = pathlib.Path(os.path.abspath(folder))
+    run = Run(split, f"{split}/{here.parent.name}/{here.name}", folder, kept)
     run.numbers("reward", 1)  # checked before anything is summed
     return run
 
@@ -289,9 +336,15 @@ def actions(run: Run) -> np.ndarray:
     """(acceleration, steering) of every frame, float32 [frames, 2]: the throttle where it is pressed, else -brake.
 
     Raises:
-      DataError: where the recording has no action of three numbers a frame.
+      DataError: where the recording has no action of three numbers a frame, or a pedal is not between 0 and 1.
     """
     throttle, steer, brake = run.numbers("action", 3).T
+    for name, pedal in (("throttle", throttle), ("brake", brake)):
+        wrong = np.flatnonzero((pedal < _PEDAL.lowest) | (pedal > _PEDAL.highest))
+        if wrong.size:
+            raise schema.DataError(f"{run.folder / FRAME_FILE}, row {wrong[0]}: {name} is {pedal[wrong[0]]:g}, "
+                                   f"expected 0 to 1. An action is throttle, steering (-1 to 1, right positive), "
+                                   f"brake: write it so.")
     return np.stack([np.where(throttle > 0, throttle, -brake), steer], axis=1)
 
 

@@ -47,7 +47,7 @@ def load_table(path: pathlib.Path) -> dict[str, Sequence]:
       Refused: where the file is damaged, is no data frame or asks for anything else.
       DataError: where there is no file.
     """
-    content = _content(path, "a pickled data frame")
+    content = files.read_bytes(path, "a pickled data frame")
     value = loads(content, str(path))
     if not isinstance(value, standins.Frame):
         raise standins.Refused(f"{path}: holds {standins.kind(value)}, expected a pickled pandas.DataFrame. "
@@ -62,7 +62,7 @@ def load_npy(path: pathlib.Path) -> Any:
       Refused: where a pickled file asks for more than arrays, dicts, lists, strings and numbers.
       DataError: where the file is missing or damaged.
     """
-    content = _content(path, "an NPY file")
+    content = files.read_bytes(path, "an NPY file")
     file = io.BytesIO(content)
     try:
         version = np.lib.format.read_magic(file)
@@ -93,15 +93,6 @@ def loads(content: bytes, where: str) -> Any:
                                f"{standins.HOW_TO_GO_ON}") from error
     finally:
         del unpickler.memo  # which refers to it in turn: all that was read would wait for the garbage collector
-
-
-def _content(path: pathlib.Path, what: str) -> bytes:
-    try:
-        return path.read_bytes()
-    except FileNotFoundError as error:
-        raise files.missing(path, what) from error
-    except OSError as error:
-        raise schema.DataError(f"{path}: cannot be read ({error}).") from error
 
 
 _Python: Any = pickle._Unpickler  # only in the Python form can opcodes be taken away

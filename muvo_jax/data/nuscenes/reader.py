@@ -55,8 +55,8 @@ class NuScenesRecording:
           key_frames: only these, 2 a second; else frames are 0.1 s apart.
 
         Raises:
-          DataError: where a table is missing or malformed, there are tables of several versions, or no scene of the
-            official splits has files.
+          DataError: where a table is missing or malformed, two scenes have one name, there are tables of several
+            versions, or no scene of the official splits has files.
         """
         path = pathlib.Path(path).expanduser()
         if camera not in CAMERAS:
@@ -163,6 +163,7 @@ class NuScenesRecording:
         """The gap-free sequences of a scene; warns of gaps."""
         needed = [key for key in _SENSORS if key in modalities and key not in lacks]
         present = np.logical_and.reduce([np.ones(scene.frames, bool), *(scene.present[key] for key in needed)])
+        sequences.warn_of_rate(f"{self._root}, {scene.name}", scene.times_s, period_s)
         late = sequences.after_gap(scene.times_s, period_s)
         pieces = sequences.gap_free(present, late)
         absent = {key: int((~scene.present[key]).sum()) for key in needed}
@@ -186,6 +187,7 @@ def _scenes(folder: pathlib.Path, camera: str, *, key_frames: bool) -> list[scen
     split_of = scene_splits.of(folder.name)
     named = tables.scene_names(folder)
     known = {token: name for token, name in named.items() if name in split_of}
+    _check_names(known, folder)
     if not known:
         raise schema.DataError(f"{folder}: none of its {words.counted(len(named), 'scene')} "
                                f"({', '.join(list(named.values())[:3])}) is in the official splits train and val. Give "
@@ -196,6 +198,16 @@ def _scenes(folder: pathlib.Path, camera: str, *, key_frames: bool) -> list[scen
     read = tables.read(folder, list(known), (scenes.LIDAR, camera), key_frames=key_frames)
     return scenes.build(folder.parent, read, [(name, split_of[name]) for name in known.values()], camera,
                         key_frames=key_frames)
+
+
+def _check_names(named: dict[str, str], folder: pathlib.Path) -> None:
+    """Raises DataError where two scenes (token -> name) have one name."""
+    tokens: dict[str, str] = {}
+    for token, name in named.items():
+        other = tokens.setdefault(name, token)
+        if other != token:
+            raise schema.DataError(f"{folder / 'scene.json'}: rows {other} and {token} are both named {name}. Unpack "
+                                   f"the metadata again; of tables that were put together, rename one.")
 
 
 def _fields_of(scene: scenes.Scene) -> frozenset[str]:

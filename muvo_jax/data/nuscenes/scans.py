@@ -24,12 +24,10 @@ def read_scan(path: pathlib.Path, lidar_to_ego: np.ndarray) -> np.ndarray:
       lidar_to_ego: float64 [4, 4].
 
     Raises:
-      DataError: for a missing or empty file, a size that is no multiple of 20 bytes, more than 1 % NaN points, or
-        numbers that are no intensities and beams.
+      DataError: for a missing, unreadable or empty file, a size that is no multiple of 20 bytes, more than 1 % NaN
+        points, or numbers that are no intensities and beams.
     """
-    if not path.is_file():
-        raise files.missing(path, "a scan of LIDAR_TOP")
-    content = path.read_bytes()
+    content = files.read_bytes(path, "a scan of LIDAR_TOP")
     if not content or len(content) % _ROW_BYTES:
         raise schema.DataError(f"{path}: {len(content)} bytes; a scan of nuScenes is a positive multiple of "
                                f"{_ROW_BYTES} bytes (float32 x, y, z, intensity, beam). The file is truncated or no "

@@ -15,7 +15,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from muvo_jax.data import ego_motion, fields, schema
+from muvo_jax.data import ego_motion, fields, files, schema
 from muvo_jax.data.nuscenes import tables as tables_lib
 from muvo_jax.limits import between
 
@@ -168,6 +168,6 @@ def _existing(root: pathlib.Path, groups: list[np.ndarray]) -> list[np.ndarray]:
         for folder, _ in parts:
             if folder not in listed:
                 path = os.path.join(os.fsencode(root), folder)
-                listed[folder] = frozenset(os.listdir(path)) if os.path.isdir(path) else frozenset()
+                listed[folder] = frozenset(files.names_in(path))
         found.append(np.array([bool(name) and name in listed[folder] for folder, name in parts], bool))
     return found

@@ -6,6 +6,7 @@ only the rows of the sensors that are asked for stay, as columns.
 
 from __future__ import annotations
 
+import itertools
 import json
 import os
 import pathlib
@@ -125,6 +126,7 @@ def _objects(file: TextIO) -> Iterator[Any]:
     while True:
         at = _BETWEEN_ROWS.match(text, at).end()  # type: ignore[union-attr]  # it matches nothing too
         if text.startswith("]", at):
+            _check_end(text[at + 1:], file)
             return
         try:
             item, at = decode(text, at)
@@ -135,6 +137,13 @@ def _objects(file: TextIO) -> Iterator[Any]:
             text, at = text[at:] + more, 0
             continue
         yield item
+
+
+def _check_end(text: str, file: TextIO) -> None:
+    """Raises ValueError where more than spaces follows the list: two tables in one file, or one overwritten in part."""
+    for more in itertools.chain([text], iter(lambda: file.read(_CHUNK_CHARS), "")):
+        if rest := more.strip():
+            raise ValueError(f"the list ends before {rest[:40]!r}")
 
 
 def _calibrations(folder: pathlib.Path, channels: tuple[str, ...]) -> tuple[tuple[Calibration, ...], dict[str, int]]:

@@ -142,19 +142,35 @@ def read_description(manifest: dict, path: pathlib.Path) -> schema.RecordingDesc
       DataError: where it is malformed.
     """
     try:
-        values = {"route_map": None} | manifest["description"]
+        values = {"route_map": None, "classes": []} | manifest["description"]
+        rate_hz = description_lib.rate_hz(values, path)
+        unknown = set(values["modalities"]) - set(fields.FIELDS)
+        if unknown:
+            raise ValueError(f"modalities has {', '.join(sorted(unknown))}, which are no recorded fields")
         sections = {name: description_lib.section({name: values[name]} if values[name] else {}, name, path,
                                                   required=False)
                     for name in ("camera", "lidar", "voxels", "route_map")}
         if "route_map" in values["modalities"] and sections["route_map"] is None:
             sections["route_map"] = _assumed_route_map(path)
         contract = config_lib.parse(config_lib.ActionContract, values["contract"], f"{path}: contract")
+        if abs(contract.rate_hz / rate_hz - 1.0) > description_lib.SAME_RATE:
+            raise ValueError(f"rate_hz is {rate_hz:g}, but contract.rate_hz is {contract.rate_hz:g}")
         return schema.RecordingDescription(
-            name=values["name"], kind=f"packed {values['kind']}", rate_hz=values["rate_hz"], contract=contract,
-            modalities=frozenset(values["modalities"]), splits=tuple(values["splits"]), notes=tuple(values["notes"]),
-            classes=tuple(values.get("classes", ())), **sections)
+            name=str(description_lib.field(values, "name", str, path)), kind=f"packed {values['kind']}",
+            rate_hz=rate_hz, contract=contract, modalities=frozenset(values["modalities"]),
+            splits=description_lib.splits(values, path), notes=_texts(values, "notes"),
+            classes=_texts(values, "classes"), **sections)
+    except schema.DataError:
+        raise
     except _MALFORMED as error:
         raise schema.DataError(f"{path}: description is malformed ({error}). Pack the recording again.") from error
+
+
+def _texts(values: dict, name: str) -> tuple[str, ...]:
+    found = values[name]
+    if not isinstance(found, list) or not all(isinstance(text, str) for text in found):
+        raise ValueError(f"{name} is {str(found)[:80]}, expected a list of text")
+    return tuple(found)
 
 
 def _assumed_route_map(path: pathlib.Path) -> config_lib.RouteMap:

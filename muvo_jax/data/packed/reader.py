@@ -19,7 +19,7 @@ from typing import Any, Literal
 import numpy as np
 from array_record.python import array_record_module
 
-from muvo_jax.data import schema
+from muvo_jax.data import fields, schema
 from muvo_jax.data.packed import manifest as manifest_lib
 from muvo_jax.data.packed import records
 
@@ -129,6 +129,13 @@ class PackedRecording:
         frame = records.decode_frame(record, where, only)
         for name in self._unwanted & frame.keys():
             del frame[name]  # type: ignore[misc]
+        camera = self.description.camera
+        if camera is not None and not np.array_equal(np.asarray(camera.intrinsics, np.float32),
+                                                     frame.get("intrinsics", ())):
+            camera = None  # a frame with a camera of its own has pictures of another size, as KITTI's dates have
+        for name in fields.FIELDS.keys() & frame.keys():
+            wanted = schema.shape_of(name, camera, self.description.voxels)
+            fields.check_shape(name, np.shape(frame[name]), wanted, where)  # type: ignore[literal-required]
         return frame
 
     def _reader(self, shard: int) -> Any:

@@ -24,7 +24,6 @@ from muvo_jax.data.packed import manifest
 _LENGTH = struct.Struct("<I")
 _ENCODINGS = ("raw", "zlib", "png", "jpeg", "float16")
 _RECORDED = {f"recorded {mode}": mode for mode in files.PICTURE_MODES}  # the bytes of a file, and how they are read
-_LARGEST_ARRAY_BYTES = 1 << 30  # what a field of a frame may claim before memory is taken for it
 # What headers, arrays and pictures that are anything at all can lead to.
 _MALFORMED = (ValueError, KeyError, TypeError, AttributeError, OSError, OverflowError, RecursionError, MemoryError,
               SyntaxError, struct.error, zlib.error, Image.DecompressionBombError)
@@ -108,6 +107,9 @@ def _encode(name: str, array: np.ndarray, encoding: Encoding, recorded: files.Pi
     if recorded is not None and not as_jpeg:
         return f"recorded {recorded.mode}", recorded.content
     if name == "points_m" and encoding.half_points:
+        if array.size and np.abs(array).max() > np.finfo(np.float16).max:
+            raise ValueError(f"points_m has a coordinate of {np.abs(array).max():g} m; float16 ends at "
+                             f"{np.finfo(np.float16).max:g} m. Pack without --half-points, or leave such points out.")
         return "float16", zlib.compress(np.ascontiguousarray(array, np.float16).tobytes(), 1)
     if array.dtype == np.uint8 and (array.ndim == 2 or (array.ndim == 3 and array.shape[2] == 3)):
         content = io.BytesIO()
@@ -124,8 +126,8 @@ def _decode(content: bytes, encoding: str, dtype: np.dtype, shape: tuple[int, ..
     if dtype.hasobject or encoding not in (*_ENCODINGS, *_RECORDED):
         raise ValueError(f"encoding {encoding!r} of {dtype} is unknown")
     size = math.prod(shape)
-    if not all(manifest.is_count(side) for side in shape) or size * dtype.itemsize > _LARGEST_ARRAY_BYTES:
-        raise ValueError(f"{dtype}{list(shape)} is larger than {_LARGEST_ARRAY_BYTES} bytes")
+    if not all(manifest.is_count(side) for side in shape) or size * dtype.itemsize > files.LARGEST_ARRAY_BYTES:
+        raise ValueError(f"{dtype}{list(shape)} is larger than {files.LARGEST_ARRAY_BYTES} bytes")
     if encoding in ("png", "jpeg") or encoding in _RECORDED:
         array = files.decode_image(content, _RECORDED.get(encoding), "its picture", shape)
     elif encoding == "float16":

@@ -14,8 +14,8 @@ from typing import NamedTuple
 
 from array_record.python import array_record_module
 
-from muvo_jax.data import files, processes, schema, sources
-from muvo_jax.data.packed import fingerprints, manifest, records
+from muvo_jax.data import files, fingerprints, processes, schema, sources
+from muvo_jax.data.packed import manifest, records
 
 PLAN_FILE = "plan.json"
 _CORRECTED = ("sequences", "frames_of_splits")  # what of a plan a corrected source may change
@@ -70,6 +70,9 @@ def pack(source: pathlib.Path | str, out: pathlib.Path | str, *, encoding: recor
     plan = _plan(recording, frames_per_shard, encoding)
     out.mkdir(parents=True, exist_ok=True)
     with processes.locked(out / f".packing-{machine}-of-{machines}", "packing"):
+        # Who divides the shards otherwise would write some of ours.
+        processes.check_free((path for path in sorted(out.glob(".packing-*-of-*"))
+                              if not path.name.endswith(f"-of-{machines}")), "packing")
         _keep_plan(out, plan)
         shards = _shards(recording, source, frames_per_shard)
         mine = shards[machine::machines]
@@ -142,9 +145,10 @@ def _plan(recording: schema.Recording, frames_per_shard: int, encoding: records.
     sequences = [manifest.describe_sequence(sequence) for sequence in recording.sequences]
     counts = {split: sum(sequence.length for sequence in recording.sequences if sequence.split == split)
               for split in described.splits}
-    return {"schema_version": manifest.SCHEMA_VERSION, "description": manifest.describe(described),
+    plan = {"schema_version": manifest.SCHEMA_VERSION, "description": manifest.describe(described),
             "encoding": vars(encoding), "frames_per_shard": frames_per_shard, "frames_of_splits": counts,
             "sequences": sequences}
+    return json.loads(json.dumps(plan))  # as it will be read: tuples become lists
 
 
 def _keep_plan(out: pathlib.Path, plan: dict) -> None:
@@ -162,7 +166,7 @@ def _keep_plan(out: pathlib.Path, plan: dict) -> None:
         if before == plan:
             return
         fixed = lambda of: {name: value for name, value in of.items() if name not in _CORRECTED}
-        if not isinstance(before, dict) or fixed(before) != fixed(json.loads(json.dumps(plan))):
+        if not isinstance(before, dict) or fixed(before) != fixed(plan):
             raise FileExistsError(f"{path} is of another recording or other settings; choose another folder or remove "
                                   f"this one.")
         (out / manifest.MANIFEST_FILE).unlink(missing_ok=True)

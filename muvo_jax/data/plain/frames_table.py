@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import csv
+import io
 import math
 import pathlib
 
 import numpy as np
 
-from muvo_jax.data import fields, schema, sequences
+from muvo_jax.data import fields, files, schema, sequences
 
 FRAMES_FILE = "frames.csv"
 REQUIRED = tuple(column for column, field in fields.COLUMNS.items() if field.required)
@@ -24,17 +25,17 @@ def read(path: pathlib.Path) -> dict[str, np.ndarray]:
     Raises:
       DataError: naming the line, the column, what came and what was expected.
     """
-    header, rows = _cells(path)
+    header, rows, lines = _cells(path)
     columns: dict[str, np.ndarray] = {}
     for column, field in fields.COLUMNS.items():
         if column not in header:
             continue
         cells = [row[header.index(column)] for row in rows]
         if field.required or any(cells):
-            where = [f"{path}, line {line}: {column}" for line in range(2, len(rows) + 2)]
+            where = [f"{path}, line {line}: {column}" for line in lines]
             columns[column] = _frame_ids(cells, where) if column == "frame_id" else np.array(
                 [number(text, field, place) for text, place in zip(cells, where, strict=True)], np.float64)
-    sequences.check_increasing(columns["timestamp_s"], [f"{path}, line {line + 2}" for line in range(len(rows))])
+    sequences.check_increasing(columns["timestamp_s"], [f"{path}, line {line}" for line in lines])
     if "yaw_rad" in columns and "yaw_rate_radps" not in columns:
         columns["yaw_rate_radps"] = _rates(columns["yaw_rad"], columns["timestamp_s"])
     return columns
@@ -42,18 +43,25 @@ def read(path: pathlib.Path) -> dict[str, np.ndarray]:
 
 def words(path: pathlib.Path, column: str) -> list[str]:
     """A column of text; empty where there is none. Raises DataError for a malformed table."""
-    header, rows = _cells(path)
+    header, rows, _ = _cells(path)
     return [row[header.index(column)] for row in rows] if column in header else []
 
 
-def _cells(path: pathlib.Path) -> tuple[list[str], list[list[str]]]:
-    """Header and rows, without blanks around cells and without empty lines."""
+def ends_with_a_line(path: pathlib.Path) -> bool:
+    """Whether the last row of a table ends, as every writer of CSV ends it; editors may not."""
+    return path.read_bytes().endswith((b"\n", b"\r"))
+
+
+def _cells(path: pathlib.Path) -> tuple[list[str], list[list[str]], list[int]]:
+    """Header, rows and the line of each, without blanks around cells and without empty lines."""
     try:
-        with path.open(newline="", encoding="utf-8-sig") as file:  # editors may write a byte order mark
-            table = [[cell.strip() for cell in row] for row in csv.reader(file, skipinitialspace=True)]
+        text = files.read_bytes(path, "the frames of a run").decode("utf-8-sig")  # editors may write a byte order mark
+        reader = csv.reader(io.StringIO(text, newline=""), skipinitialspace=True)
+        table = [(reader.line_num, [cell.strip() for cell in row]) for row in reader]
     except (UnicodeDecodeError, csv.Error) as error:
         raise schema.DataError(f"{path}: not a CSV table ({error}). Record the run again.") from error
-    header, *rows = [row for row in table if any(row)] or [[]]
+    (_, header), *filled = [(line, row) for line, row in table if any(row)] or [(1, [])]
+    lines, rows = [line for line, _ in filled], [row for _, row in filled]
     lacking = [name for name in REQUIRED if name not in header]
     if lacking:
         other = next((mark for mark in (";", "\t") if mark in ",".join(header)), None)
@@ -63,11 +71,11 @@ def _cells(path: pathlib.Path) -> tuple[list[str], list[list[str]]]:
     twice = sorted({name for name in header if name in fields.COLUMNS and header.count(name) > 1})
     if twice:
         raise schema.DataError(f"{path}: column {', '.join(twice)} is there twice. Remove one of them.")
-    for line, row in enumerate(rows, start=2):
+    for line, row in filled:
         if len(row) != len(header):
             raise schema.DataError(f"{path}, line {line}: {len(row)} cells under {len(header)} columns. Numbers have a "
                                    f"point, not a comma; every row has a cell for each column.")
-    return header, rows
+    return header, rows, lines
 
 
 def _frame_ids(cells: list[str], where: list[str]) -> np.ndarray:
@@ -106,7 +114,7 @@ def number(text: str, field: fields.Field, where: str) -> float:
     if not text and field.name == "is_terminal":
         return 0.0
     try:
-        value = _WORDS.get(text.lower())
+        value = _WORDS.get(text.lower()) if field.dtype is np.bool_ else None
         value = (float(text) if _is_plain(text) else math.nan) if value is None else value
     except ValueError:
         value = math.nan

@@ -119,9 +119,11 @@ class PlainRecording:
             modalities=modalities | (_OF_IMAGE if "image" in modalities else frozenset()),
             classes=self._class_names if labels & {"image_classes", "point_classes"} else (),
             route_map=(section("route_map", False) or config_lib.RouteMap()) if "route_map" in modalities else None)
-        if self.description.camera is not None:
-            for run in every:
+        for run in every:
+            if self.description.camera is not None:
                 cameras.check(run.columns, self.description.camera, run.folder / FRAMES_FILE)
+            if "occupancy" in modalities and voxels is not None:
+                description.check_rule(run.folder / fields.FIELDS["occupancy"].folder, voxels)
 
     def read(self, sequence: schema.Sequence, index: int) -> schema.RawFrame:
         """See schema.Recording."""
@@ -173,22 +175,21 @@ class PlainRecording:
         values = self._read(path, name)
         if name == "points_m":
             values = files.finite_points(values, path)
+        if name == "point_classes":
+            points_m = self._read(path, "points_m")
+            if len(values) != len(points_m):
+                raise schema.DataError(f"{path}: {len(values)} {fields.FIELDS[name].array} of {len(points_m)} points. "
+                                       f"Write a class for each point, in the order of the points.")
+            values = values[np.isfinite(points_m).all(axis=1)]  # finite_points leaves the others out
         return {name: values}
 
     def _read(self, path: pathlib.Path, name: str) -> np.ndarray:
-        field, described = fields.FIELDS[name], self.description
+        field = fields.FIELDS[name]
         if path.suffix.lower() == ".npz":
             values = files.read_npz(path, field.array)
         else:
             values = files.read_image(path, _MODES[name])
-        camera, grid = described.camera, described.voxels
-        sizes: dict[str, int | None] = dict.fromkeys("HWNXYZ")
-        if camera is not None:
-            sizes |= {"H": camera.height_px, "W": camera.width_px}
-        if grid is not None:
-            sizes |= dict(zip("XYZ", grid.shape, strict=True))
-        values = fields.conform(name, values, str(path), tuple(sizes[size] if isinstance(size, str) else size
-                                                               for size in field.shape))
+        values = fields.conform(name, values, str(path), self.description.shape_of(name))
         if name in ("image_classes", "point_classes"):
             fields.check_classes(name, values, self._class_names, str(path))
         return values
@@ -214,12 +215,17 @@ class PlainRecording:
         return frozenset(found)
 
     def _not_in_file(self, run: Run, together: list[fields.Field]) -> set[str]:
-        """Of fields that share a file those that the run's first one does not hold; where it holds none: nothing."""
+        """Of fields that share a file those that the run's files do not hold; where they hold none: nothing.
+
+        The first, the last and one in between are asked: a single file that is damaged says nothing of the others.
+        """
         if len(together) < 2:
             return set()
-        frame_id = int(run.columns["frame_id"][int(np.argmax(self._files[run.name][together[0].folder].present))])
-        path = self._path(run, together[0].name, frame_id)
-        missing = {field.name for field in together if not field.is_sensor and not files.npz_holds(path, field.array)}
+        there = np.flatnonzero(self._files[run.name][together[0].folder].present)
+        frame_ids = run.columns["frame_id"][there[[0, len(there) // 2, -1]]].tolist()
+        held = [files.npz_names(self._path(run, together[0].name, frame_id)) for frame_id in frame_ids]
+        known = frozenset().union(*(names for names in held if names is not None))
+        missing = {field.name for field in together if not field.is_sensor and field.array not in known}
         return missing if len(missing) < len(together) else set()
 
     def _cut(self, run: Run, modalities: frozenset[str], lacks: tuple[str, ...],
@@ -231,6 +237,7 @@ class PlainRecording:
             there = self._files[run.name][folder].present
             present &= there
             absent[folder] = int((~there).sum())
+        sequences.warn_of_rate(str(run.folder), run.columns["timestamp_s"], period_s)
         late = sequences.after_gap(run.columns["timestamp_s"], period_s)
         restarts = np.zeros(len(present), bool)
         if "is_terminal" in run.columns:
@@ -261,6 +268,12 @@ def read_runs(root: pathlib.Path, splits: tuple[str, ...]) -> list[Run]:
     if not found:
         raise schema.DataError(f"{root}: no complete run (a folder <split>/<run> with {FRAMES_FILE}) in the splits "
                                f"{', '.join(splits)}. The root holds {files.listing(root)}. Record it again.")
+    names: dict[pathlib.Path, str] = {}
+    for run in found:
+        other = names.setdefault(run.folder.resolve(), run.name)
+        if other != run.name:  # a split linked to another one would be judged on what was trained
+            raise schema.DataError(f"{root}: {other} and {run.name} are one folder, {run.folder.resolve()}. Remove one "
+                                   f"of the links.")
     return found
 
 
@@ -270,13 +283,19 @@ def _runs_of(root: pathlib.Path, split: str) -> list[Run]:
     if near and not (root / split).is_dir():
         raise schema.DataError(f"{near[0]}: expected the name {split}, as {DESCRIPTION_FILE} says. Rename the folder.")
     folders = sorted(path for path in (root / split).glob("*") if path.is_dir() and not path.name.startswith("."))
-    incomplete = [folder.name for folder in folders if not (folder / FRAMES_FILE).is_file()]
-    if incomplete:
-        warnings.warn(f"{root / split}: {len(incomplete)} of {len(folders)} runs have no {FRAMES_FILE}, are left out "
-                      f"as incomplete: {', '.join(incomplete[:6])}.", schema.DataWarning, stacklevel=4)
+    for folder in folders:
+        if any("\ud800" <= letter <= "\udfff" for letter in folder.name):  # Python's for bytes that are no UTF-8
+            raise schema.DataError(f"{folder.parent}: a run is named {folder.name!r}, which is no UTF-8. Rename the "
+                                   f"folder.")
     read = [Run(split, folder, frames_table.read(folder / FRAMES_FILE)) for folder in folders
             if (folder / FRAMES_FILE).is_file()]
-    return [run for run in read if len(run.columns["frame_id"])]
+    found = [run for run in read if len(run.columns["frame_id"])]
+    complete = {run.folder for run in found}
+    incomplete = [folder.name for folder in folders if folder not in complete]
+    if incomplete:
+        warnings.warn(f"{root / split}: {len(incomplete)} of {len(folders)} runs have no {FRAMES_FILE}, or no row in "
+                      f"it, are left out as incomplete: {', '.join(incomplete[:6])}.", schema.DataWarning, stacklevel=4)
+    return found
 
 
 def frame_files(run: Run, name: str) -> list[pathlib.Path]:
@@ -301,21 +320,44 @@ def _check_case(run: Run) -> None:
 
 def _files_of(run: Run, wanted: list[fields.Field]) -> dict[str, _Files]:
     """The files of a run by folder. Fields that share one have the same suffixes."""
-    found = {}
+    found, beyond = {}, {}
+    frame_ids = run.columns["frame_id"].tolist()
+    last = max(frame_ids)  # a counter that wraps ends elsewhere
     for field in wanted:
         if field.folder in found:
             continue
         names = files.numbered(run.folder / field.folder, field.suffixes)
-        frame_ids = run.columns["frame_id"].tolist()
+        beyond[field.folder] = sum(number > last for number in names)
         usual = f"{{:0{_DIGITS}d}}{field.suffixes[0]}"
         found[field.folder] = _Files(np.array([frame_id in names for frame_id in frame_ids], bool), {
             frame_id: names[frame_id] for frame_id in frame_ids
             if frame_id in names and names[frame_id] != usual.format(frame_id)})
+    _check_rows(run, {folder: count for folder, count in beyond.items() if count})
     return found
+
+
+def _check_rows(run: Run, beyond: dict[str, int]) -> None:
+    """Warns of files (folder -> how many) that come after the last row of frames.csv, the table that is written last.
+
+    Raises:
+      DataError: where that row is cut off, too: what it says cannot be trusted.
+    """
+    if not beyond:
+        return
+    path, counts = run.folder / FRAMES_FILE, ", ".join(f"{count} in {folder}" for folder, count in beyond.items())
+    if not frames_table.ends_with_a_line(path):
+        raise schema.DataError(f"{path}: its last row does not end, and files come after it ({counts}): the table was "
+                               f"copied in part. Copy it again.")
+    warnings.warn(f"{path}: files that come after its last row are left out ({counts}). Was all of it copied?",
+                  schema.DataWarning, stacklevel=4)
 
 
 def _class_names(header: dict, path: pathlib.Path) -> tuple[str, ...]:
     """The names of the classes, those of the town where the recording does not say."""
     if "classes" not in header:
         return fields.TOWN_CLASSES
-    return description.names(header, "classes", path)
+    found = description.names(header, "classes", path)
+    if len(found) > fields.UNKNOWN:
+        raise schema.DataError(f"{path}: classes names {len(found)}; a pixel has one of at most {fields.UNKNOWN} "
+                               f"({fields.UNKNOWN} is unknown). Put some together.")
+    return found

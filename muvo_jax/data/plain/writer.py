@@ -12,6 +12,7 @@ import io
 import pathlib
 import shutil
 from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 from PIL import Image
@@ -67,7 +68,11 @@ class RunWriter:
     """
 
     def __init__(self, root: pathlib.Path | str, split: str, run: str):
-        """Raises FileExistsError where the run is complete already."""
+        """Raises ValueError for names that are none of folders, FileExistsError where the run is complete already."""
+        for what, name in (("split", split), ("run", run)):
+            if not files.is_folder_name(name):
+                raise ValueError(f"{what} {name!r}: expected the name of a folder in {root}, which readers find: no "
+                                 f"dot in front, no slash or colon, not empty.")
         self._root = pathlib.Path(root).expanduser()
         self.folder = self._root / split / run
         if is_complete(root, split, run):
@@ -75,21 +80,22 @@ class RunWriter:
         shutil.rmtree(self.folder, ignore_errors=True)
         self.folder.mkdir(parents=True)
         self._rows: list[dict[str, str]] = []
+        self._sections: dict[str, Any] | None = None  # of recording.toml, once it is there
 
     def write(self, frame: Mapping) -> None:
         """Writes the files of one frame.
 
         Args:
-          frame: either as a reader gives it (schema.RawFrame), which is then read back bit for bit; or frame_id (int)
-            and timestamp_s, the other names of COLUMNS as far as they are known, and any of image uint8 [H, W, 3],
-            depth_m float [H, W] (infinite in the sky; centimetres are kept), classes and route_map uint8 [H, W],
-            image_moving_mask bool [H, W] and occupancy_moving_mask bool [X, Y, Z],
+          frame: either as a reader gives it (schema.RawFrame), which is then read back bit for bit; or frame_id (int),
+            timestamp_s, speed_mps, acceleration and steering, the other names of COLUMNS as far as they are known, and
+            any of image uint8 [H, W, 3], depth_m float [H, W] (infinite in the sky; centimetres are kept), classes and
+            route_map uint8 [H, W], image_moving_mask bool [H, W] and occupancy_moving_mask bool [X, Y, Z],
             points_m float [N, 3] (with point_tags uint8 [N], what each hit), occupancy uint8 [X, Y, Z],
             birds_eye_classes uint8 [X, Y] with birds_eye_instances int32 [X, Y].
 
         Raises:
           ValueError: where frame_id does not increase, a name is unknown (naming the nearest), or DataError where a
-            field is of another shape or has numbers that it cannot have.
+            field is missing, of another shape than described or as the others, or has numbers that it cannot have.
         """
         fields.unknown(frame, KEYS, f"{self.folder}: field")
         frame_id = int(frame["frame_id"])
@@ -98,8 +104,12 @@ class RunWriter:
             raise ValueError(f"frame_id {frame_id} after {self._rows[-1]['frame_id']}: frames must be written in "
                              f"order.")
         row = _row(frame, where)
-        arrays = {name: fields.conform(name, value, where) for key, value in frame.items()
+        self._check_time(row, where)
+        arrays = {name: fields.conform(name, value, where, self._shape_of(name)) for key, value in frame.items()
                   if fields.FIELDS.get(name := _ALIASES.get(key, key), _NO_FILE).folder and name not in _NOT_WRITTEN}
+        if "point_classes" in arrays and len(arrays["point_classes"]) != len(arrays.get("points_m", ())):
+            raise schema.DataError(f"{where}: {len(arrays['point_classes'])} classes of "
+                                   f"{len(arrays.get('points_m', ()))} points. Write a class for each point.")
         depth_m = arrays.pop("depth_m", None)
         if depth_m is not None:
             self._write_depth(frame_id, depth_m, exactly="action" in frame)
@@ -124,12 +134,28 @@ class RunWriter:
         writer.writerows(self._rows)
         files.write_atomically(self.folder / plain_reader.FRAMES_FILE, table.getvalue())
 
+    def _check_time(self, row: dict[str, str], where: str) -> None:
+        lacking = [column for column in frames_table.REQUIRED if column not in row]
+        if lacking:
+            raise schema.DataError(f"{where}: no {', '.join(lacking)}, which every frame of the plain format has.")
+        if self._rows and float(row["timestamp_s"]) <= float(before := self._rows[-1]["timestamp_s"]):
+            raise schema.DataError(f"{where}: time {row['timestamp_s']} s does not come after the frame before it "
+                                   f"({before} s). Take a clock that is not set back while you record.")
+
+    def _shape_of(self, name: str) -> tuple[int | None, ...] | None:
+        """Of a field, as recording.toml says; None where there is none yet."""
+        if self._sections is None:
+            try:
+                header = plain_reader.read_header(self._root)
+                self._sections = {section: description.section(header, section, self._root, required=False)
+                                  for section in ("camera", "voxels")}
+            except schema.DataError:  # not described yet
+                return None
+        return schema.shape_of(name, **self._sections)
+
     def _settle_cameras(self) -> None:
-        try:
-            header = plain_reader.read_header(self._root)
-            camera = description.section(header, "camera", self._root, required=False)
-        except schema.DataError:  # not described yet
-            camera = None
+        self._shape_of("image")
+        camera = (self._sections or {}).get("camera")
         for field in cameras.FIELDS if camera is not None else ():
             usual = _cells_of(field, np.asarray(getattr(camera, field.name), field.dtype))
             every = [usual | {column: row[column] for column in usual if column in row} for row in self._rows]

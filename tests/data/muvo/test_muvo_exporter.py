@@ -95,6 +95,36 @@ def test_an_export_is_resumed_and_other_sensors_are_refused(source, exported, tm
         muvo_exporter.export(source, tmp_path)
 
 
+def test_runs_of_another_recording_are_neither_kept_nor_mixed_with_this_one(source, exported, tmp_path):
+    out = shutil.copytree(exported, tmp_path / "out")
+    assert muvo_exporter.export(source, out) == 0
+    other = shutil.copytree(source, tmp_path / "other")
+    (other / "train/a").rename(other / "train/z")
+    with pytest.raises(FileExistsError, match=r"Town01/0000 was made of 14 frames from 0 on of train/a of mine, .* "
+                                              r"would now be 14 frames from 0 on of train/z of mine.*other folder"):
+        muvo_exporter.export(other, out)
+    assert (out / "runs.csv").read_bytes() == (exported / "runs.csv").read_bytes()
+    (out / "runs.csv").unlink()
+    with pytest.raises(FileExistsError, match=r"was made of something that runs\.csv does not say"):
+        muvo_exporter.export(source, out)
+
+
+def test_a_source_that_was_changed_makes_no_half_new_export(source, tmp_path):
+    changed = shutil.copytree(source, tmp_path / "source")
+    out = changed / "muvo"  # which is no part of what it is made of
+    muvo_exporter.export(changed, out)
+    assert muvo_exporter.export(changed, out) == 0
+    picture = changed / "train/a/image/000003.png"
+    shutil.copy(changed / "train/a/image/000004.png", picture)
+    with pytest.raises(FileExistsError, match=r"train/Town01/0000 was made of .* fingerprint"):
+        muvo_exporter.export(changed, out)
+    (out / "trainval/train/Town01/0000" / muvo_runs.FRAME_FILE).unlink()
+    assert muvo_exporter.export(changed, out) == FRAMES
+    shutil.rmtree(changed / "val_rl/b")
+    with pytest.raises(FileExistsError, match=r"val0/Town01/0000 was made of .* would now be no run of this recording"):
+        muvo_exporter.export(changed, out)
+
+
 def test_what_the_authors_reader_needs_is_asked_for(tmp_path):
     with pytest.raises(schema.DataError, match="has no depth, classes"):
         muvo_exporter.export(writers.write_plain(tmp_path / "rec"), tmp_path / "out")
@@ -122,3 +152,10 @@ def test_built_like_the_authors_own(exported):
                 (key, value.dtype, value.flags.f_contiguous) for key, value in found[1].items()]
         else:
             assert found[0].dtype == found[1].dtype == np.uint16
+
+
+@pytest.mark.parametrize("town", ["", "../../x", "Berlin", "Town01/x"])
+def test_a_town_that_the_authors_code_would_not_find_is_refused(tmp_path, town):
+    with pytest.raises(ValueError, match=f"--town={town}: expected a name such as Town01"):
+        muvo_exporter.export(tmp_path / "source", tmp_path / "out", town=town)
+    assert not (tmp_path / "out").exists()

@@ -2,6 +2,7 @@
 
 import dataclasses
 import shutil
+import warnings
 
 import numpy as np
 import pytest
@@ -225,9 +226,94 @@ def test_an_export_says_the_weather_and_the_town_of_each_run(tmp_path):
     assert frame["image_instance_mask"].all() and (frame["point_classes"] == 4).all()
 
 
+def linked(root, target, *, tone):
+    """A run 0001 beside the real 0000 of training that is a link to a folder named 0000, all pictures of one tone."""
+    write_run(target)
+    for path in (target / "image").iterdir():
+        Image.fromarray(np.full((32, 64, 3), tone, np.uint8)).save(path)
+    (root / "trainval/train/Town01/0001").symlink_to(target)
+
+
+def test_linked_runs_are_named_as_they_are_called_here(tmp_path):
+    root = layout(tmp_path / "rec")
+    linked(root, tmp_path / "elsewhere/Town01/0000", tone=200)
+    recording = sources.open_recording(root)
+    assert {sequence.name: greys(recording, sequence)[0] for sequence in recording.sequences} == {
+        "train/Town01/0000": 10, "train/Town01/0001": 200, "val0/Town01/0000": 10}
+
+
+def test_a_link_to_a_mode_is_that_mode_by_its_name_or_its_target(tmp_path):
+    root = layout(tmp_path / "rec")
+    for name, target in (("mine", root / "trainval/val0"), ("val1", root / "trainval/train")):
+        (tmp_path / name).symlink_to(target)
+    assert sources.open_recording(tmp_path / "mine").description.splits == ("val0",)
+    assert sources.open_recording(tmp_path / "val1").description.splits == ("val1",)
+
+
+def test_two_runs_of_one_name_are_refused(tmp_path):
+    for name in ("monday", "tuesday"):
+        write_run(tmp_path / name / "train/Town01/0000")
+    with pytest.raises(schema.DataError, match=r"monday/.*0000 and .*tuesday/.*0000 are both run train/Town01/0000"):
+        sources.open_recording(tmp_path)
+
+
+def test_tags_beyond_a_byte_are_no_tags(tmp_path):
+    root = layout(tmp_path, tags=OLDER)
+    for path in root.glob("trainval/*/*/*/points_semantic/*.npy"):
+        scan = safe_pickle.load_npy(path)
+        path.write_bytes(frame_pickle.npy_of_dict(scan | {"ObjTag": scan["ObjTag"].astype(np.uint32) + 256}))
+    with pytest.raises(schema.DataError, match=r"points_semantic_\d+.npy: ObjTag has 266, expected .* 0 to 255"):
+        sources.open_recording(root, labels={"point_classes"})
+
+
 def test_drives_recorded_in_carla_name_their_classes_and_scale(tmp_path):
     carla_recorder._describe(tmp_path, carla_recorder.Settings())
     header = plain_reader.read_header(tmp_path)
     assert tuple(header["classes"]) == muvo_files.CLASSES
     assert config_lib.parse(config_lib.RouteMap, header["route_map"], "route_map") == muvo_reader.ROUTE_MAP
     assert "vehicle" in header["classes"] and "pedestrian" in header["classes"]
+
+
+def test_tags_of_two_simulators_are_not_read_as_one(tmp_path):
+    write_run(tmp_path / "trainval/train/Town01/0000", tags=OLDER)
+    write_run(tmp_path / "trainval/val0/Town01/0000", tags=NEWER)
+    with pytest.raises(schema.DataError, match=r"run train/Town01/0000 has .* up to 0\.9\.13, val0/Town01/0000 those"):
+        sources.open_recording(tmp_path, labels={"point_classes"})
+
+
+def test_rows_that_name_files_of_two_frames(tmp_path):
+    def open_with(change):
+        shutil.rmtree(tmp_path, ignore_errors=True)
+        for run in layout(tmp_path, tags=OLDER).glob("trainval/*/*/*"):
+            columns = dict(safe_pickle.load_table(run / muvo_runs.FRAME_FILE))
+            columns["points_semantic_path"] = change(list(columns["points_semantic_path"]))
+            (run / muvo_runs.FRAME_FILE).write_bytes(frame_pickle.frame(columns))
+        return sources.open_recording(tmp_path)
+
+    with pytest.raises(schema.DataError, match="row 1 of points_semantic_path: frame 22 comes after frame 23"):
+        open_with(lambda names: names[::-1])
+    with pytest.raises(schema.DataError, match="row 1 of points_semantic_path: frame 3 comes after frame 3"):
+        open_with(lambda names: names[3:4] * len(names))
+    with pytest.warns(schema.DataWarning, match=r"24 of 24 rows name files of two numbers, such as row 0: "
+                                                r"points_semantic_path is number 1, image_path 0"):
+        open_with(lambda names: [*names[1:], names[-1].replace("023", "024")])
+
+
+def test_frames_bear_the_number_of_their_files_and_runs_of_other_steps_are_warned_of(tmp_path):
+    write_run(tmp_path / "trainval/train/Town01/0000", numbers=range(3, 51, 2))
+    write_run(tmp_path / "trainval/val0/Town01/0000")
+    (tmp_path / "sensors.toml").write_text("rate_hz = 5\n")
+    with pytest.warns(schema.DataWarning, match="in steps of 1 in val0/Town01/0000 and in steps of 2 in train"):
+        recording = sources.open_recording(tmp_path)
+    first = next(sequence for sequence in recording.sequences if sequence.split == "train")
+    assert int(recording.read(first, 0)["frame_id"]) == 3 + 2 * first.start
+
+
+def test_a_backup_beside_the_recording_is_no_part_of_it(tmp_path):
+    layout(tmp_path)
+    write_run(tmp_path / "backup")
+    (tmp_path / "trainval/train/Town01/.thumbs").mkdir()
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        recording = sources.open_recording(tmp_path)
+    assert {sequence.name for sequence in recording.sequences} == {"train/Town01/0000", "val0/Town01/0000"}

@@ -201,6 +201,13 @@ def test_what_would_take_for_ever_is_refused_at_once(use, tmp_path):
         safe_pickle.load_npy(tmp_path / "f.npy")
 
 
+def test_a_dict_that_is_referred_to_again_is_made_once(tmp_path):
+    path, shared = tmp_path / "scan.npy", {"ObjTag": np.zeros(2, np.uint8)}
+    path.write_bytes(frame_pickle.npy_of_dict({"one": {"in": shared}, "other": {"in": shared}}))
+    scan = safe_pickle.load_npy(path)
+    assert scan["one"]["in"] is scan["other"]["in"] and scan["one"]["in"]["ObjTag"].shape == (2,)
+
+
 def object_header():
     file = io.BytesIO()
     np.lib.format.write_array_header_1_0(file, {"descr": "|O", "fortran_order": False, "shape": ()})

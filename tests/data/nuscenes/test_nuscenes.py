@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import pathlib
 import shutil
 import warnings
 
@@ -277,6 +278,8 @@ def in_row(channel, **changes):
 
 
 @pytest.mark.parametrize(("table", "alter", "message"), [
+    ("scene", lambda rows: [row | {"name": "scene-0061"} for row in rows],
+     rf"scene.json: rows {writer.token('scene', 'scene-0061')} and {writer.token('scene', 'scene-0103')} are both na"),
     ("scene", in_first(name=7), r"scene.json: row .* has name = '7' .int., expected str"),
     ("sample_data", in_row("LIDAR_TOP", timestamp=1.5e9), r"sample_data.json: row .* has timestamp = .*expected int"),
     ("sample_data", in_row("CAM_FRONT", timestamp=-1), "sample_data.json: row .* timestamp -1, expected microseconds"),
@@ -313,6 +316,8 @@ def test_tables_with_what_cannot_be_are_refused_by_row(root, table, alter, messa
     (lambda text: text.replace("{", "[7", 1), "row 1 is not readable"),
     (lambda text: "[" * 100_000, "row 1 is not readable"),
     (lambda text: "[3]", "row 1 is not readable .found '3' instead of an object"),
+    (lambda text: text + text, r"row \d+ is not readable .the list ends before '\["),
+    (lambda text: text + "\n" * 3_000_000 + '"CAM_', r"row \d+ is not readable .the list ends before '\"CAM_'"),
     (lambda text: text.encode("utf-16"), "row 1 is not readable"),
 ])
 def test_a_damaged_table_is_refused(root, damage, message):
@@ -333,6 +338,9 @@ def test_tables_are_read_whatever_chunks_they_fall_into(tmp_path, monkeypatch, c
         assert list(tables.rows(path)) == rows
     path.write_text("[]")
     assert list(tables.rows(path)) == []
+    path.write_text("[] ]")
+    with pytest.raises(schema.DataError, match=r"row 1 is not readable .the list ends before '\]'"):
+        list(tables.rows(path))
 
 
 def test_a_row_without_end_is_given_up(tmp_path, monkeypatch):
@@ -366,6 +374,18 @@ def test_a_scan_that_is_none_is_refused(root, rows, message):
     rows.tofile(path)
     with pytest.raises(schema.DataError, match=f"{path.name}: {message}"):
         recording.read(recording.sequences[0], 0)
+
+
+def test_a_scan_that_may_not_be_read_is_refused_by_name(root, monkeypatch):
+    recording = opened(root)
+    path = root / f"samples/LIDAR_TOP/n000__LIDAR_TOP__{writer.START_US}.pcd.bin"
+
+    def refuse(_):
+        raise PermissionError(13, "Permission denied")
+
+    monkeypatch.setattr(pathlib.Path, "read_bytes", refuse)
+    with pytest.raises(schema.DataError, match=f"{path.name}: expected a scan of LIDAR_TOP, but it cannot be read"):
+        recording.read_fields(recording.sequences[0], 0, {"points_m"})
 
 
 def test_a_picture_of_another_size_is_refused(root):

@@ -160,3 +160,35 @@ def test_a_description_is_written_once_and_stays_as_somebody_formatted_it(tmp_pa
     assert path.read_text(encoding="utf-8") == text
     with pytest.raises(FileExistsError, match="describes something else; choose another folder"):
         files.write_description(path, values, "something else")
+
+
+@pytest.mark.parametrize(("split", "run"), [("train", ""), ("", "a"), ("val_rl", ".."), ("train", "x/y"),
+                                            ("train", ".hidden"), ("train", "a\\b")])
+def test_a_name_that_is_none_of_a_folder_removes_nothing(tmp_path, split, run):
+    describe(tmp_path)
+    record(tmp_path)
+    before = sorted(tmp_path.rglob("*"))
+    with pytest.raises(ValueError, match="expected the name of a folder in"):
+        plain_writer.RunWriter(tmp_path, split, run)
+    assert sorted(tmp_path.rglob("*")) == before
+
+
+@pytest.mark.parametrize(("change", "message"), [
+    ({"speed_mps": None, "steering": None}, "no speed_mps, steering, which every frame"),
+    ({"timestamp_s": 0.05}, r"frame 2: time 0\.05 s does not come after the frame before it \(0\.1 s\)"),
+    ({"image": np.zeros((8, 16, 3), np.uint8)}, r"shape \[8, 16, 3\] of image, expected \[8, 12, 3\]"),
+    ({"occupancy": np.zeros((4, 5, 5), np.uint8)}, r"shape \[4, 5, 5\] of occupancy, expected \[4, 5, 6\]"),
+    ({"point_tags": np.zeros(3, np.uint8)}, "3 classes of 22 points"),
+])
+def test_what_a_reader_would_refuse_is_not_written(tmp_path, change, message):
+    describe(tmp_path)
+    rng = np.random.default_rng(0)
+    writer = plain_writer.RunWriter(tmp_path, "train", "000")
+    for index in range(2):
+        writer.write(make_frame(index, rng))
+    wrong = {name: value for name, value in (make_frame(2, rng) | change).items() if value is not None}
+    with pytest.raises(schema.DataError, match=message):
+        writer.write(wrong)
+    writer.write(make_frame(2, rng))
+    writer.close()
+    assert sources.open_recording(tmp_path).sequences[0].length == 3

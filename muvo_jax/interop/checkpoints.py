@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
+import json
 import os
 import pathlib
 import re
@@ -37,6 +38,7 @@ _PUBLISHED = {
 _HEAD_PREFIXES = {"image": "rgb_decoder.", "range_view": "lidar_re.", "occupancy": "voxel_decoder.",
                   "action": "policy.", "birds_eye": "bev_decoder."}
 Fields = dict[str, Any]  # of a ModelConfig
+CONFIG = "muvo_jax.config"  # in the metadata of an exported run
 ShapeOf = Callable[[str, int], tuple[int, ...]]  # of a key that has so many axes
 
 
@@ -53,12 +55,14 @@ class Stored:
       state_dict: reference key (without "model.") -> array, torch layout.
       beside: keys of other things in the state_dict -> what they are.
       facts: what the file says of its training, such as global_step.
+      config: of the run that it was exported from; None of a file of the authors' code.
     """
 
     path: pathlib.Path
     state_dict: Mapping[str, np.ndarray]
     beside: Mapping[str, str]
     facts: Mapping[str, Any]
+    config: config_lib.Config | None = None
 
 
 def read(path: str | os.PathLike) -> Stored:
@@ -66,10 +70,13 @@ def read(path: str | os.PathLike) -> Stored:
 
     Raises:
       TorchFileError, SafetensorsError: for a file that cannot be read.
-      CheckpointMismatch: where it holds no tensors by name.
+      CheckpointMismatch: where it holds no tensors by name, or a config of ours that cannot be read.
     """
-    path = pathlib.Path(path).expanduser()
-    loaded = safetensors_file.load(path) if path.suffix == ".safetensors" else torch_file.load(path)
+    path, metadata = pathlib.Path(path).expanduser(), dict[str, str]()
+    if path.suffix == ".safetensors":
+        loaded, metadata = safetensors_file.load_with_metadata(path)
+    else:
+        loaded = torch_file.load(path)
     outer = loaded if isinstance(loaded, dict) else {}
     tensors = outer.get("state_dict", outer)
     if not isinstance(tensors, dict) or not any(isinstance(value, np.ndarray) for value in tensors.values()):
@@ -83,17 +90,33 @@ def read(path: str | os.PathLike) -> Stored:
     beside = {key: reason for key in tensors
               if (reason := next((why for pattern, why in _BESIDE.items() if re.search(pattern, key)), None))}
     inner = {key.removeprefix(_PREFIX): value for key, value in tensors.items() if key not in beside}
-    facts = {name: outer[name] for name in ("epoch", "global_step", "pytorch-lightning_version")
-             if isinstance(outer.get(name), (int, str))}
-    return Stored(path, inner, beside, facts)
+    facts: dict[str, Any] = {name: outer[name] for name in ("epoch", "global_step", "pytorch-lightning_version")
+                             if isinstance(outer.get(name), (int, str))}
+    if metadata.get("step", "").isdecimal():
+        facts["global_step"] = int(metadata["step"])
+    return Stored(path, inner, beside, facts, _exported(metadata, path))
+
+
+def _exported(metadata: Mapping[str, str], path: pathlib.Path) -> config_lib.Config | None:
+    """The config of the run that export_torch wrote a file from."""
+    if CONFIG not in metadata:
+        return None
+    try:
+        return config_lib.Config.from_dict(json.loads(metadata[CONFIG]))
+    except (ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
+        raise CheckpointMismatch(f"{path}: its metadata {CONFIG!r} is no configuration of this version ({error}). "
+                                 f"Export the run again.") from error
 
 
 def recognise(stored: Stored) -> config_lib.ModelConfig:
-    """The architecture that the keys and shapes of a checkpoint describe, with numerics="reference".
+    """The architecture that the keys and shapes of a checkpoint describe, with numerics="reference"; of a run that was
+    exported its own, since shapes do not tell all of it.
 
     Raises:
       CheckpointMismatch: where they describe no model of this family.
     """
+    if stored.config is not None:
+        return stored.config.model
     state_dict = stored.state_dict
     landmarks = ("rssm.pre_gru_net.0.weight", "encoder.", "policy.fc.0.weight")
     absent = [name for name in landmarks if not any(key.startswith(name) for key in state_dict)]

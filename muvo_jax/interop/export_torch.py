@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 import pathlib
 import sys
 from typing import Annotated
@@ -15,15 +16,17 @@ from muvo_jax import command_line, late
 with late.imports():
     import jax
 
+    from muvo_jax import config as config_lib
     from muvo_jax import safetensors_file
-    from muvo_jax.interop import names
+    from muvo_jax.interop import checkpoints, names
 
 
 @dataclasses.dataclass(frozen=True)
 class Options:
-    """Writes a run's weights as a safetensors file that the authors' PyTorch model loads (strict=False).
+    """Writes a run's weights under the names of the authors' PyTorch code, as a safetensors file.
 
-    strict=False, because counters and templates that no forward pass reads are not part of it.
+    Their model loads those of a run of the reference's network and sizes (--preset=reference, strict=False: counters
+    and templates that no forward pass reads are not part of it). muvo_jax.convert reads those of any run back.
     """
 
     run: Annotated[pathlib.Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
@@ -46,9 +49,22 @@ def export(options: Options, show) -> None:
     state_dict = names.reference_state_dict(variables, loaded.config.model)
     safetensors_file.save(options.out, state_dict, {
         "variant": loaded.config.model.variant, "latent": loaded.config.model.latent.kind,
-        "numerics": loaded.config.model.numerics, "step": str(loaded.step)})
+        "numerics": loaded.config.model.numerics, "step": str(loaded.step),
+        checkpoints.CONFIG: json.dumps(loaded.config.to_dict())})
+    if theirs := _unlike_theirs(loaded.config.model):
+        show.warn(f"the authors' code has no {theirs}: it will not take these weights, or make other numbers of them. "
+                  f"They read back with python -m muvo_jax.convert.")
     show.line(f"wrote {options.out}: {len(state_dict)} tensors of {loaded.config.model.variant}, "
               f"numerics={loaded.config.model.numerics}")
+
+
+def _unlike_theirs(model: config_lib.ModelConfig) -> str:
+    """What of a network has no counterpart in the authors' code, sizes aside; "" for nothing."""
+    found = [name for name, unlike in (
+        (f"numerics={model.numerics}", model.numerics != "reference"),
+        (f"first_guess={model.first_guess.kind}", not isinstance(model.first_guess, config_lib.ZeroGuess)),
+        (f"action_path={model.action_path}", model.action_path == "recurrence")) if unlike]
+    return ", ".join(found)
 
 
 def main() -> int:

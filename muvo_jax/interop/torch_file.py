@@ -80,11 +80,23 @@ class Foreign:
             self.append(value)
 
 
+def _known(dtype: Any) -> np.dtype:
+    """NumPy's of a type of numbers that torch names; a class that stands for another one would become "object".
+
+    Raises:
+      TorchFileError: for complex numbers, 8-bit floats and the like.
+    """
+    if not any(dtype is known for known in (*_STORAGE_DTYPES.values(), *_DTYPES.values())):
+        raise TorchFileError(f"it holds tensors of {getattr(dtype, '__name__', dtype)}, which are not supported: "
+                             f"convert them to float32 with PyTorch first")
+    return np.dtype(dtype)
+
+
 class _Storage:
     """A typed stretch of the file; `array` is filled in when its place is known."""
 
     def __init__(self, dtype: Any, count: int):
-        self.dtype, self.count = np.dtype(dtype), count
+        self.dtype, self.count = _known(dtype), count
         self.array: np.ndarray | None = None
 
 
@@ -95,7 +107,7 @@ class _Tensor:
         if not isinstance(storage, _Storage):
             raise pickle.UnpicklingError("a tensor without a storage")
         self.storage, self.offset, self.shape, self.strides = storage, offset, tuple(shape), tuple(strides)
-        self.dtype = storage.dtype if dtype is None else np.dtype(dtype)
+        self.dtype = storage.dtype if dtype is None else _known(dtype)
 
     def __setstate__(self, state: Any) -> None:
         """Attributes that Python code gave to a tensor; not data."""
@@ -133,11 +145,20 @@ def _reconstructor(cls, base, state):
     return cls() if isinstance(cls, type) and issubclass(cls, Foreign) else Foreign(cls, base, state)
 
 
+def _attribute(owner, name):
+    """A method of a foreign object or class: before torch 2.4 a OneCycleLR names its own (anneal_func)."""
+    if isinstance(owner, Foreign) or (isinstance(owner, type) and issubclass(owner, Foreign)):
+        return Foreign(owner, name)
+    raise TorchFileError(f"it asks for builtins.getattr of {type(owner).__name__[:60]}, which is no data of a "
+                         f"checkpoint; refused, nothing was executed")
+
+
 _NAMES: dict[tuple[str, str], Any] = {
     ("collections", "OrderedDict"): collections.OrderedDict,
     ("collections", "defaultdict"): lambda *args: {},
     ("_codecs", "encode"): lambda text, encoding: str(text).encode("latin1"),  # how old protocols write bytes
     **{(module, "_reconstructor"): _reconstructor for module in ("copyreg", "copy_reg")},
+    **{(module, "getattr"): _attribute for module in ("builtins", "__builtin__")},
     ("torch._utils", "_rebuild_tensor"): _rebuild_tensor,
     ("torch._utils", "_rebuild_tensor_v2"): _rebuild_tensor,
     ("torch._utils", "_rebuild_tensor_v3"): _rebuild_tensor_v3,

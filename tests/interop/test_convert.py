@@ -80,6 +80,28 @@ def test_there_and_back(tiny, tmp_path):
         np.testing.assert_array_equal(exported[key], value)
 
 
+def test_an_exported_run_comes_back_as_it_was_where_shapes_do_not_tell(tmp_path, capsys):
+    """Sides that are odd multiples of 32, heads of attention, and what standard numerics do otherwise."""
+    config = config_lib.override_all(presets.get("tiny"), {
+        "model.image_size": (96, 128), "model.range_view": config_lib.RangeViewGeometry(rows=32, columns=96),
+        "model.fusion.heads": 2, "model.fusion.token_channels": 16, "data.stride": 3})
+    model = world_model.WorldModel(config.model)
+    variables = drawn_variables(config.model)
+    checkpoint.save_variables(tmp_path / "run", 12, variables, config=config)
+    export_torch.export(export_torch.Options(tmp_path / "run", tmp_path / "w.safetensors"), screen.Screen())
+    assert "the authors' code has no numerics=standard: it will not take these weights" in capsys.readouterr().out
+    run_convert(tmp_path / "w.safetensors", tmp_path / "again")
+    again = muvo_jax.load(tmp_path / "again")
+    assert again.config == config and again.step == 12 and again.model == model
+    jax.tree.map(np.testing.assert_array_equal, dict(again.variables), variables)
+
+
+def test_a_config_of_ours_that_cannot_be_read_is_named(tiny, tmp_path):
+    safetensors_file.save(tmp_path / "w.safetensors", tiny[2], {checkpoints.CONFIG: '{"model": 3}'})
+    with pytest.raises(checkpoints.CheckpointMismatch, match=r"w.safetensors: its metadata 'muvo_jax.config' is no"):
+        run_convert(tmp_path / "w.safetensors", tmp_path / "again")
+
+
 def test_half_precision_of_the_old_format(tiny, tmp_path):
     _, variables, state_dict = tiny
     halves = {key: value.astype(np.float16) for key, value in state_dict.items()}

@@ -123,3 +123,16 @@ def test_the_choice_of_depth_bins_that_the_pack_made_is_kept_for_what_follows(tm
     embedding, check = full_models._encoded(context, plane, encode, weights)
     np.testing.assert_array_equal(embedding, [1.0])
     assert check.note == ""
+
+
+@pytest.mark.parametrize("wrong", [np.nan, np.inf])
+def test_a_value_that_is_no_number_fails_where_only_some_are_stored(tmp_path, wrong):
+    """Of a large entry every tenth value is stored, and what is between is seen in its statistics alone."""
+    values = np.linspace(1.0, 2.0, 100, dtype=np.float32)
+    statistics = np.array([values.mean(), values.std(), 1.0, 2.0, np.sqrt(np.square(values).sum())])
+    np.savez(tmp_path / "p.npz", **{"a::sub": values[::10], "a::meta": np.array([10, 100]), "a::stats": statistics})
+    file = golden.File(tmp_path / "p.npz")
+    assert file.error("a", values) < 1e-6
+    broken = values.copy()
+    broken[3] = wrong
+    assert file.error("a", broken) == np.inf

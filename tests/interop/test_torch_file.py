@@ -51,6 +51,21 @@ class Call:
         return self.function, self.args
 
 
+# Pickles of protocol 2 as Python writes them of a class torch.optim.lr_scheduler.OneCycleLR.
+_OF_CLASS = b"ctorch.optim.lr_scheduler\nOneCycleLR\n"
+_OF_OBJECT = _OF_CLASS + b")\x81}X\x0b\x00\x00\x00total_stepsK\x64sb"
+
+
+@pytest.mark.parametrize("owner", [_OF_CLASS, _OF_OBJECT], ids=["static", "bound"])
+def test_lightnings_schedulers_before_torch_2_4_name_a_method_of_their_own(owner, tmp_path):
+    """OneCycleLR.state_dict()["anneal_func"], https://github.com/pytorch/pytorch/pull/123775; the authors have 2.0."""
+    method = b"c__builtin__\ngetattr\n" + owner + b"X\x0e\x00\x00\x00_annealing_cos\x86R"
+    with zipfile.ZipFile(tmp_path / "a.ckpt", "w") as archive:
+        archive.writestr("archive/data.pkl", b"\x80\x02}X\x0b\x00\x00\x00anneal_func" + method + b"s.")
+    read = torch_file.load(tmp_path / "a.ckpt")
+    assert isinstance(read["anneal_func"], torch_file.Foreign) and read["anneal_func"].args[1] == "_annealing_cos"
+
+
 @pytest.mark.parametrize("write", WRITERS.values(), ids=WRITERS)
 @pytest.mark.parametrize("function", ["system", "eval", "getattr"])
 def test_code_is_refused_and_not_executed(write, function, tmp_path):
@@ -162,3 +177,9 @@ def test_safetensors_of_the_library_are_read(tmp_path):
     library.save_file({name: array for name, array in ARRAYS.items() if name != "bfloat16"}, tmp_path / "l.safetensors")
     read = safetensors_file.load(tmp_path / "l.safetensors")
     np.testing.assert_array_equal(read["float32"], ARRAYS["float32"])
+
+
+@pytest.mark.parametrize("name", ["complex64", "float8_e4m3fn", "uint16"])
+def test_a_type_of_numbers_that_numpy_lacks_is_named(name, tmp_path):
+    with pytest.raises(torch_file.TorchFileError, match=rf"it holds tensors of .*{name}, which are not supported"):
+        torch_file._Storage(type(name, (torch_file.Foreign,), {}), 3)

@@ -120,6 +120,8 @@ def _observed(model: world_model.WorldModel, variables: Any, embedding: jax.Arra
 
 
 _filter = jax.jit(rollout.filter_embeddings, static_argnums=0)
+_observe = jax.jit(world_model.WorldModel.observe_step, static_argnums=0)
+_imagine = jax.jit(world_model.WorldModel.imagine_step, static_argnums=0)
 
 
 def _entries(context: cases.Context, model: world_model.WorldModel, variables: Any, embedding: jax.Array, *,
@@ -162,8 +164,8 @@ def _deployed(model: world_model.WorldModel, variables: Any, embedding: jax.Arra
     state = model.initial_state(1)
     zeros = jnp.zeros_like(state.stochastic)
     noise = StepNoise(zeros, zeros, jnp.zeros((1,), bool))
-    seen, _ = jax.jit(model.observe_step)(variables, noise, state, action, embedding[:, -1], jnp.zeros((1,), bool))
-    dreamt, _ = jax.jit(model.imagine_step)(variables, zeros, seen, action)
+    seen, _ = _observe(model, variables, noise, state, action, embedding[:, -1], jnp.zeros((1,), bool))
+    dreamt, _ = _imagine(model, variables, zeros, seen, action)
     for place, state in (("deployment", last), ("deployment_forward/0", seen), ("deployment_forward/1", seen),
                          ("deployment_forward/2", dreamt)):
         driven = rollout.decode(model, variables, state, ("action",)).action[:, None]

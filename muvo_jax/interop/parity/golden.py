@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import functools
 import json
+import math
 import os
 import pathlib
 import zipfile
@@ -72,11 +73,11 @@ class File:
         got = np.asarray(got)
         want, have, extra = self._compare(name, got)
         if want.size == 0:
-            return extra
+            return _not_nan(extra)
         want, have = want.astype(np.float64), have.astype(np.float64)
         difference = np.where(np.isnan(want) & np.isnan(have), 0.0, np.abs(want - have))
         largest = np.nanmax(np.abs(want)) if np.isfinite(want).any() else 1.0
-        return float(max(difference.max() / max(largest, 1e-6), extra))
+        return _not_nan(np.max([difference.max() / max(largest, 1e-6), extra]))
 
     def share_different(self, name: str, got: Any, ignore: np.ndarray | None = None) -> float:
         """Share of the stored values that are not equal, for integers; `ignore` masks entries that are stored whole.
@@ -102,9 +103,14 @@ class File:
             return self.arrays[name], got, 0.0
         _, std, _, _, norm = self.arrays[name + "::stats"]
         wide = got.astype(np.float64)
-        extra = max(abs(wide.std() - std) / max(std, 1e-6),
-                    abs(np.sqrt(np.square(wide).sum()) - norm) / max(norm, 1e-6))
+        extra = np.max([abs(wide.std() - std) / max(std, 1e-6),  # NaN where one of them is
+                        abs(np.sqrt(np.square(wide).sum()) - norm) / max(norm, 1e-6)])
         return self.values(name), got.reshape(-1)[::self.stride(name)], float(extra)
+
+
+def _not_nan(error: Any) -> float:
+    """An error that is NaN compares as none: infinite, it fails."""
+    return math.inf if math.isnan(error) else float(error)
 
 
 class Settings:

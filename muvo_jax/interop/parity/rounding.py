@@ -35,8 +35,12 @@ def in_pairs(values: Any, pairs: int = 8, size: float = 1e-5) -> Iterator[Any]:
 
 
 def _moved(values: Any, seed: int, size: float) -> Any:
-    normal = np.random.default_rng(seed).standard_normal
-    move = lambda leaf: np.asarray(np.asarray(leaf) * (1.0 + size * normal(leaf.shape)), np.float32)
+    random, scale = np.random.default_rng(seed), np.float32(size)
+
+    def move(leaf):
+        leaf = np.asarray(leaf, np.float32)
+        return leaf + leaf * (scale * random.standard_normal(leaf.shape, np.float32))
+
     return jax.tree.map(move, values)
 
 

@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterable, Sequence
 import numpy as np
 
 from muvo_jax.interop.parity import cases, golden, rounding
+from muvo_jax.training import screen
 
 Print = Callable[[str], None]
 RECORDINGS_REASON = "needs recordings: give their folder with --recordings=PATH"
@@ -107,7 +108,7 @@ def run_file(checks: cases.FileChecks, context: cases.Context, report: Report, w
                     done.add(check.entry)
                     _record(check, context.file, label, report, write)
         except Exception as error:
-            stopped.append(f"{_name(group)} stopped with {_said(error)}")
+            stopped.append(f"{_name(group)} stopped with {screen.said(error)}")
     report.stopped += [f"{label}: {problem}" for problem in stopped]
     for entry in context.file.names:
         if entry not in done:
@@ -126,7 +127,7 @@ def _record(check: cases.Check, file: golden.File, label: str, report: Report, w
     try:
         error, note = _error(check, file)
     except Exception as problem:
-        error, note = math.inf, str(problem) if isinstance(problem, ValueError) else _said(problem)
+        error, note = math.inf, str(problem) if isinstance(problem, ValueError) else screen.said(problem)
     passed = error <= check.tolerance
     report.passed += passed
     report.failed += not passed
@@ -170,7 +171,3 @@ def _chosen(registry: Sequence[cases.FileChecks], only: tuple[str, ...]) -> list
 
 def _name(group: cases.Group) -> str:
     return getattr(group, "__name__", str(group))
-
-
-def _said(error: Exception) -> str:
-    return f"{type(error).__name__}: {(str(error).splitlines() or [''])[0]}"

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import json
+import math
 import pathlib
 import sys
 import time
@@ -101,9 +102,17 @@ python -m muvo_jax.drive runs/town-tr --episodes=2 --seconds=8 --seed=1
 def drive(options: Options, show: screen.Screen) -> dict[str, Any]:
     """Does what the command line asks for; returns what drive.json holds."""
     names = agents_of(options.agent)
-    if options.episodes < 1 or options.seconds <= 0:
-        raise ValueError(f"--episodes is {options.episodes} and --seconds {options.seconds}; both must be positive.")
+    if min(options.episodes, options.horizon) < 1 or not 0 < options.seconds < math.inf:
+        raise ValueError(f"--episodes is {options.episodes}, --horizon {options.horizon} and --seconds "
+                         f"{options.seconds}; all must be positive and finite.")
+    if options.policy is not None and "learned" not in names:
+        raise ValueError(f"--policy={options.policy} is for an agent that learned, and --agent={options.agent} names "
+                         f"none: add it, as in --agent=learned,{options.agent}.")
+    if not 0 <= options.seed < 10**6:
+        raise ValueError(f"--seed is {options.seed}; it must be at least 0 and below a million.")
     loaded = command_line.load_run(options.run, options.checkpoint, show)
+    folder = options.out or loaded.folder / "drive"
+    folder.mkdir(parents=True, exist_ok=True)  # now, not after all drives
     policy = None
     if "learned" in names:
         policy = policy_file.load(options.policy or loaded.folder / policy_file.FOLDER, loaded)
@@ -133,8 +142,6 @@ def drive(options: Options, show: screen.Screen) -> dict[str, Any]:
     show.console.print(drive_report.screen_table(report))
     for line in drive_report.sensitivity_rows(report):
         show.line(line)
-    folder = options.out or loaded.folder / "drive"
-    folder.mkdir(parents=True, exist_ok=True)
     numbers, page = folder / "drive.json", folder / "drive.md"
     numbers.write_text(json.dumps(evaluation_report.json_ready(report), indent=1) + "\n", encoding="utf-8")
     page.write_text(drive_report.markdown(report), encoding="utf-8")

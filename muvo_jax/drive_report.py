@@ -64,15 +64,14 @@ def screen_table(report: Mapping[str, Any]) -> rich.table.Table:
 
 
 def sensitivity_rows(report: Mapping[str, Any]) -> list[str]:
-    """The sensitivity to actions as a Markdown table; nothing where it was not measured."""
-    if "sensitivity" not in report:
-        return []
-    return ["| response to | steps | of | source | gain (1 is right, 0 ignores actions) | correlation |",
-            "|---|---:|---|---|---:|---:|",
-            *(f"| {contrast} | {steps} | {head} | {evaluation_report.SOURCES[source]} | {score['gain']:.2f} | "
-              f"{score['correlation']:.2f} |" for steps, contrasts in report["sensitivity"].items()
-              for contrast, heads in contrasts.items() for head, sources in heads.items()
-              for source, score in sources.items())]
+    """The sensitivity to actions as a Markdown table; nothing where it was not measured, or of no head."""
+    rows = [f"| {contrast} | {steps} | {head} | {evaluation_report.SOURCES[source]} | {score['gain']:.2f} | "
+            f"{score['correlation']:.2f} |" for steps, contrasts in report.get("sensitivity", {}).items()
+            for contrast, heads in contrasts.items() for head, sources in heads.items()
+            for source, score in sources.items()]
+    header = ["| response to | steps | of | source | gain (1 is right, 0 ignores actions) | correlation |",
+              "|---|---:|---|---|---:|---:|"]
+    return header + rows if rows else []
 
 
 def markdown(report: Mapping[str, Any]) -> str:
@@ -90,11 +89,11 @@ def markdown(report: Mapping[str, Any]) -> str:
              f"along the route until then; its whole length is {report['route_m']:g} m. Along and across: root mean "
              f"squares of the accelerations, per step of {report['step_s']:g} s. In brackets 95 % intervals over the "
              f"drives: Wilson's of success, bootstrap of the others.", ""]
-    if "sensitivity" in report:
+    if answers := sensitivity_rows(report):
         lines += ["Does imagination answer to actions? From each takeover on, the same noise under two plans: the "
                   "difference that the model predicts between them, regressed on the town's. Warp-last moves what was "
                   "last seen by what the plan does to the car, and has learned nothing.", "",
-                  *sensitivity_rows(report), ""]
+                  *answers, ""]
     return "\n".join(lines)
 
 
@@ -125,9 +124,12 @@ def film(loaded: run_lib.Run, town: simulator.Town, drive: closed_loop.Drive, ke
 
 
 def _imagined(loaded, drive, key, policy, horizon, scene) -> dict[str, list[sheets.View]]:
-    """Title -> a view of each moment: what the model makes of it now, and at the end of what is planned."""
+    """Title -> a view of each moment: what the model makes of it now, and at the end of what is planned; nothing where
+    no head of the model predicts what the town shows."""
     model, variables = loaded.model, loaded.variables
     heads = tuple(head for head in baselines.SENSORS if head in model.config.heads)
+    if not heads:
+        return {}
     states, memory = closed_loop.latents(drive.moments)
     if policy is None:
         plans = closed_loop.plans(drive.moments)

@@ -97,9 +97,9 @@ python -m muvo_jax.drive runs/town-tr --agent=learned,expert,constant,random
 def train_agent(options: Options, show: screen.Screen) -> dict[str, Any]:
     """Does what the command line asks for; returns what agent.json says of the training."""
     began_s, began_cpu_s = time.perf_counter(), time.process_time()
-    for name in ("rounds", "updates", "starts", "futures", "batch"):
+    for name in ("rounds", "updates", "starts", "futures", "batch", "judge_drives"):
         if getattr(options, name) < 1:
-            raise ValueError(f"--{name} is {getattr(options, name)}; it must be at least 1.")
+            raise ValueError(f"--{name.replace('_', '-')} is {getattr(options, name)}; it must be at least 1.")
     loaded = command_line.load_run(options.run, options.checkpoint, show)
     world = environment.Environment.of_run(loaded, observation="road", reward_config=rewards.RewardConfig(
         speed_limit_mps=options.speed_limit_mps), caution=uncertainty.Caution(options.trust, options.branches))

@@ -93,23 +93,28 @@ def symexp(x: Array) -> Array:
     return jnp.sign(x) * jnp.expm1(jnp.abs(x))
 
 
-def lambda_returns(reward: Array, discount: Array, value: Array, lambda_: float) -> Array:
-    """R_t = r_t + g_t ((1 - lambda) v_t+1 + lambda R_t+1), the last one bootstrapped from the last value.
+def lambda_returns(reward: Array, discount: Array, value: Array, lambda_: float,
+                   truncated: Array | None = None) -> Array:
+    """R_t = r_t + g_t ((1 - lambda) v_t+1 + lambda R_t+1), the last one, and truncated ones, bootstrapped from v_t+1.
 
     Args:
       reward, discount: [H, ...] of each step; a discount of 0 ends the drive.
       value: [H, ...] of the state AFTER each step.
       lambda_: in [0, 1].
+      truncated: bool [H, ...], where a drive is cut off though its world goes on; None for nowhere before the end.
 
     Returns:
       [H, ...].
     """
+    truncated = jnp.zeros(reward.shape, jnp.bool_) if truncated is None else truncated
+
     def step(following, inputs):
-        reward, discount, value = inputs
+        reward, discount, value, truncated = inputs
+        following = jnp.where(truncated, value, following)
         here = reward + discount * ((1.0 - lambda_) * value + lambda_ * following)
         return here, here
 
-    _, returns = jax.lax.scan(step, value[-1], (reward, discount, value), reverse=True)
+    _, returns = jax.lax.scan(step, value[-1], (reward, discount, value, truncated), reverse=True)
     return returns
 
 
@@ -199,9 +204,12 @@ def imagine(environment, config, params, key, actor):
 @functools.partial(jax.jit, static_argnames=("environment", "config"))
 def update(environment: environment_lib.Environment, config: ActorCriticConfig, params: environment_lib.EnvParams,
            key: Array, learner: Learner) -> tuple[Learner, dict[str, Array]]:
-    """One update; metrics: "return" and "reward" (means), "entropy", "critic_loss", "actor_loss", "terminated"."""
+    """One update; metrics: "return" and "reward" (means), "entropy", "critic_loss", "actor_loss", "terminated".
+
+    Steps after the end of an episode (params.max_steps_in_episode, if it is less than config.horizon) do not count.
+    """
     seen, drawn, transitions = jax.lax.stop_gradient(imagine(environment, config, params, key, learner.actor))
-    drives = lambda actor: (seen, drawn, transitions.reward, transitions.terminated)
+    drives = lambda actor: (seen, drawn, transitions.reward, transitions.terminated, transitions.truncated)
     return _learn(config, learner, drives, score=1.0)
 
 
@@ -225,24 +233,24 @@ def improve(environment: environment_lib.Environment, config: ActorCriticConfig,
             return jnp.tanh(drawn), drawn
 
         seen, reward, terminated, drawn = futures_lib.drive(environment, futures, start, act)
-        return seen, drawn, reward, terminated
+        return seen, drawn, reward, terminated, None
 
     return _learn(config, learner, drives, score=config.score)
 
 
 def _learn(config, learner, drives, score):
     """One step of the optimiser. drives: actor -> observations [H + 1, N, F], actions before tanh [H, N, 2], and
-    rewards and ends [H, N]."""
+    rewards, ends and truncations (or None) [H, N]."""
     hold = jax.lax.stop_gradient
 
     def loss(networks):
         actor, critic = networks
-        seen, drawn, reward, terminated = drives(actor)
+        seen, drawn, reward, terminated, truncated = drives(actor)
         going_on = 1.0 - terminated.astype(jnp.float32)
         values = _value(config, learner.slow_critic, seen)
-        returns = lambda_returns(reward, config.discount * going_on, values[1:], config.lambda_)
-        # Steps after a predicted collision do not count.
-        alive = jnp.cumprod(going_on, axis=0)
+        returns = lambda_returns(reward, config.discount * going_on, values[1:], config.lambda_, truncated)
+        # Steps after a predicted collision, or after the end of an episode, do not count.
+        alive = jnp.cumprod(going_on if truncated is None else going_on * ~truncated, axis=0)
         weight = jnp.concatenate([jnp.ones_like(alive[:1]), alive[:-1]])
         spread = hold(jnp.percentile(returns, 95) - jnp.percentile(returns, 5))
         scale = (1.0 - config.scale_rate) * learner.scale + config.scale_rate * spread

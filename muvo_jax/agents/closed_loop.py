@@ -176,10 +176,15 @@ def drive(simulator: Simulator, driver: Driver, key: Array, seed: int, steps: in
 
 
 def _check_action(action: np.ndarray, seed: int, step: int) -> None:
-    if np.shape(action) != (2,) or not np.isfinite(action).all():
+    if np.shape(action) != (2,) or not np.abs(action).max() <= 1.0 + 1e-6:  # NaN neither
         raise ValueError(f"drive: with seed {seed}, at step {step} from the first observation on, the driver chose "
                          f"{np.asarray(action).tolist()}; expected two finite numbers in [-1, 1] (acceleration, "
                          f"steering).")
+
+
+def _check_rate(where: str, simulator: Simulator, environment: environment_lib.Environment) -> None:
+    if abs(simulator.step_s - environment.step_s) > 1e-6:
+        raise ValueError(f"{where}: the simulator steps {simulator.step_s} s, the model {environment.step_s} s.")
 
 
 def planning_driver(simulator: Simulator, environment: environment_lib.Environment, variables: Variables,
@@ -208,9 +213,7 @@ def planning_driver(simulator: Simulator, environment: environment_lib.Environme
         shared_future = environment.shares_future
     if horizon < 1:
         raise ValueError(f"planning_driver: horizon is {horizon}; it must be at least 1.")
-    if abs(simulator.step_s - environment.step_s) > 1e-6:
-        raise ValueError(f"planning_driver: the simulator steps {simulator.step_s} s, the model "
-                         f"{environment.step_s} s.")
+    _check_rate("planning_driver", simulator, environment)
 
     def driver(key, memory, state, previous):
         key_filter, key_plan = jax.random.split(key)
@@ -259,8 +262,12 @@ def policy_driver(simulator: Simulator, environment: environment_lib.Environment
         jax.tree_util.Partial(function, parameters), as actor_critic.policy makes it, so that new parameters compile
         nothing anew. Whether it draws its actions or takes its mode is its own affair.
       sampled: sample the filter's latents instead of taking their means, which is what planning_driver does.
+
+    Raises:
+      ValueError: for a simulator that steps at another rate than the model.
     """
-    driver_policy = policy if isinstance(policy, jax.tree_util.Partial) else jax.tree_util.Partial(policy)
+    _check_rate("policy_driver", simulator, environment)
+    driver_policy = environment_lib.as_partial(policy)
 
     def driver(key, memory, state, previous):
         key_filter, key_policy = jax.random.split(key)

@@ -26,6 +26,7 @@ from muvo_jax.model.world_model import WorldModel
 from muvo_jax.ops import motion as motion_ops
 from muvo_jax.types import Array, LatentState, Variables
 
+OBSERVATIONS = ("features", "road")  # beside tuples of decoded heads
 ACTION_CHANNELS = checks.ACTION_CHANNELS
 RewardFunction = Callable[[rewards.Moment], tuple[Array, Array, dict[str, Array]]]
 
@@ -58,6 +59,11 @@ class Environment:
     caution: uncertainty.Caution = uncertainty.Caution()
 
     def __post_init__(self):
+        if not isinstance(self.observation, str):
+            object.__setattr__(self, "observation", tuple(self.observation))  # a list has no hash
+        if isinstance(self.observation, str) and self.observation not in OBSERVATIONS:
+            raise ValueError(f"Environment: observation is {self.observation!r}, expected \"features\", \"road\" or a "
+                             f"tuple of decoded heads such as (\"image\",).")
         heads = self.decoded_heads
         missing = [head for head in heads if head not in self.model.config.heads]
         if missing:
@@ -65,6 +71,10 @@ class Environment:
             raise ValueError(f"Environment: reward or observation read the head {names}, but this run trained "
                              f"{', '.join(self.model.config.heads)}. Train it (--with-heads={','.join(missing)}); for "
                              f"a reward without occupancy pass reward_config=RewardConfig(collision=0.0).")
+        if self._tests_collisions and "occupancy" not in self._reward_heads:
+            raise ValueError(f"Environment: the driving reward seeks collisions in occupancy, which is not among "
+                             f"reward_heads={self.reward_heads}; leave reward_heads out, or pass "
+                             f"reward_config=RewardConfig(collision=0.0).")
         if self.ego_path is None and self.reward_function is None:
             raise ValueError(f"Environment: the driving reward needs the ego path, contract.kinematics is "
                              f"{self.contract.kinematics!r}, and this run trained no head ego_motion. Train it "
@@ -164,7 +174,7 @@ class Environment:
           ValueError: for a bank of another model or recording, an empty one, or a horizon below 1.
         """
         episodes.check(self.model, bank)
-        checks.counts(horizon, None)
+        checks.counts(horizon, None, "params")
         checks.finite("params", temperature=temperature)
         if self.trained_steps is not None and horizon > self.trained_steps and not isinstance(
                 bank.speed_mps, jax.core.Tracer):
@@ -224,6 +234,7 @@ class Environment:
         """As `step`; beside it what the reward read, by head, the occupancy as `caution` has it."""
         forks.check("Environment.step")
         action = self._checked(action)
+        checks.finite_on_host("Environment.step", state=state)
         checks.forward_mode("Environment.step", self.model, params.variables, state, action)
         latents = self._branches(key, state.latent, action, params)
         latent = latents[0]
@@ -247,9 +258,7 @@ class Environment:
     def restart(self, key: Array, state: EnvState, observation: Any, final: Array,
                 params: EnvParams) -> tuple[EnvState, Any]:
         """Where `final`, a fresh start takes the place of state and observation."""
-        fresh_observation, fresh = self.reset(key, params)
-        choose = lambda new, old: jnp.where(final, new, old)
-        return jax.tree.map(choose, fresh, state), jax.tree.map(choose, fresh_observation, observation)
+        return episodes.restart(self, key, state, observation, final, params)
 
     def occupancy_ahead(self, params: EnvParams, key: Array, state: EnvState, plan: Array) -> Array:
         """Occupancy logits [H, X, Y, Z, 2] at the reward's scale after each step of a plan [H, 2], in the frame of the
@@ -280,7 +289,8 @@ class Environment:
 
     def _reward(self, moment: rewards.Moment) -> tuple[Array, Array, dict[str, Array]]:
         if self.reward_function is not None:
-            return self.reward_function(moment)
+            reward, ended, terms = self.reward_function(moment)
+            return jnp.asarray(reward, jnp.float32), jnp.asarray(ended, jnp.bool_), terms
         return rewards.driving_reward(moment, grid=self.model.config.voxels, contract=self.contract, step_s=self.step_s,
                                       config=self.reward_config, pooled=self.pooled)
 
@@ -325,12 +335,13 @@ class Environment:
         return {name: decoded[name] for name in self.observation}
 
     def _checked(self, action: Array) -> Array:
-        return jnp.clip(checks.one_action(action, (), "Environment.step"), -1.0, 1.0)
+        return jnp.clip(checks.one_action(action, (), "Environment.step", clips=True), -1.0, 1.0)
 
 
 def play(environment: Environment, params: EnvParams, key: Array, state: EnvState, driver: Any,
          horizon: int) -> tuple[EnvState, Transition]:
-    """Rolls one episode on: driver is actions [H, 2] or a jax.tree_util.Partial policy(key, observation) -> action.
+    """Rolls one episode on: driver is actions [H, 2] or a policy(key, observation) -> action, one with parameters as
+    jax.tree_util.Partial(function, parameters), so that new ones compile nothing anew.
 
     Returns the states and Transitions [H, ...]; nothing restarts.
 
@@ -340,6 +351,8 @@ def play(environment: Environment, params: EnvParams, key: Array, state: EnvStat
       TypeError: for forward-mode derivatives through convolutions that have none (ModelConfig.convolution).
     """
     forks.check("play")
+    checks.counts(horizon, None, "play")
+    driver = as_partial(driver)
     if not callable(driver):
         if jnp.shape(driver) != (horizon, ACTION_CHANNELS):
             raise ValueError(f"play: got actions {list(jnp.shape(driver))}, expected [{horizon}, 2].")
@@ -350,6 +363,12 @@ def play(environment: Environment, params: EnvParams, key: Array, state: EnvStat
     if callable(driver):
         checks.chosen_actions(actions, "play")
     return played
+
+
+def as_partial(driver: Any) -> Any:
+    """A plain function as what jax.jit takes for an argument; anything else as it is."""
+    plain = callable(driver) and not isinstance(driver, jax.tree_util.Partial)
+    return jax.tree_util.Partial(driver) if plain else driver
 
 
 @functools.partial(jax.jit, static_argnames=("environment", "horizon"))

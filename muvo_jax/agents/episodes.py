@@ -185,3 +185,11 @@ class Transition:
     @property
     def final(self) -> Array:
         return self.terminated | self.truncated
+
+
+def restart(core: Any, key: Array, state: EnvState, observation: Any, final: Array,
+            params: Any) -> tuple[EnvState, Any]:
+    """Where `final`, a fresh start of an environment takes the place of state and observation."""
+    fresh_observation, fresh = core.reset(key, params)
+    choose = lambda new, old: jnp.where(final, new, old)
+    return jax.tree.map(choose, fresh, state), jax.tree.map(choose, fresh_observation, observation)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import math
 from collections.abc import Iterable
 from typing import Any
 
@@ -71,7 +72,8 @@ def measure(model: world_model.WorldModel, variables: Variables, key: Array, bat
     if "best_psnr_db" in sums:
         per_step |= {name: sums[name] / done for name in ("best_psnr_db", "mean_psnr_db")}
     return result | {"per_step": {name: value.tolist() for name, value in per_step.items()},
-                     "trust_horizon": int(uncertainty.trust_horizon(jnp.asarray(trust)))}
+                     "trust_horizon": int(uncertainty.trust_horizon(jnp.asarray(trust)))
+                     if np.isfinite(trust).all() else math.nan}
 
 
 @functools.partial(jax.jit, static_argnames=("model", "context", "horizon", "branches"))

@@ -20,7 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from muvo_jax.agents import environment as environment_lib
-from muvo_jax.agents import rewards, road
+from muvo_jax.agents import episodes, rewards, road
 from muvo_jax.agents import route as route_lib
 from muvo_jax.agents.episodes import EnvState, Transition
 from muvo_jax.model import checks, glimpse
@@ -92,9 +92,12 @@ def imagine(environment: environment_lib.Environment, params: environment_lib.En
       horizon: steps, H.
 
     Raises:
-      ValueError: for another environment, or starts from which evidence cannot be worked out once.
+      ValueError: for another environment, starts that the bank does not have or from which evidence cannot be worked
+        out once, or a policy that chose what is no number, naming the step.
     """
     check(environment)
+    checks.counts(horizon, None, "futures.imagine")
+    memory_lib.check_indices("futures.imagine", "starts", starts, params.bank.size, "starts of the bank")
     vantage = params.bank.latent.vantage
     if params.bank.memory is not None and vantage is not None:
         newest = params.bank.memory.pose.shape[1] - 1
@@ -102,7 +105,10 @@ def imagine(environment: environment_lib.Environment, params: environment_lib.En
             raise ValueError(f"futures.imagine: some starts are observations {np.unique(vantage.last).tolist()} of "
                              f"windows of {newest + 1}; expected the newest of each, Environment.starts(observed, "
                              f"batch, skip={newest}).")
-    return _imagine(environment, params, key, jnp.asarray(starts, jnp.int32), policy, horizon)
+    found, actions = _imagine(environment, params, key, jnp.asarray(starts, jnp.int32),
+                              environment_lib.as_partial(policy), horizon)
+    checks.chosen_actions(jnp.swapaxes(actions, 0, 1), "futures.imagine")
+    return found
 
 
 @functools.partial(jax.jit, static_argnames=("environment", "horizon"))
@@ -127,14 +133,15 @@ def _imagine(environment, params, key, starts, policy, horizon):
         obstacles = feared = jax.vmap(environment.obstacle_plan)(read["occupancy"])
         if cautious:
             obstacles = jax.vmap(environment.obstacles, (0, None))(state, params)
-        return (state, obstacles), (obstacles, state.motion.pose, transition.reward, transition.terms["progress_m"],
-                                    transition.terminated, feared if cautious else None)
+        kept = (obstacles, state.motion.pose, transition.reward, transition.terms["progress_m"], transition.terminated,
+                feared if cautious else None)
+        return (state, obstacles), (kept, action)
 
-    _, after = jax.lax.scan(step, (state, obstacles), jax.random.split(key, horizon))
+    _, (after, actions) = jax.lax.scan(step, (state, obstacles), jax.random.split(key, horizon))
     plans, poses, reward, progress_m, terminated, feared = jax.tree.map(lambda leaf: jnp.swapaxes(leaf, 0, 1), after)
     first = lambda start, rest: jnp.concatenate([start[:, None], rest], axis=1)
     return Futures(first(obstacles, plans), first(state.motion.pose, poses), params.seen, params.routes,
-                   bank.speed_mps, reward, progress_m, terminated, feared)
+                   bank.speed_mps, reward, progress_m, terminated, feared), actions
 
 
 def _of_starts(params, starts):
@@ -288,9 +295,14 @@ class SharedFutures:
     def step(self, key: Array, state: EnvState, action: Array, params: FuturesParams) -> tuple[EnvState, Transition]:
         """One step under action [2], clipped to [-1, 1]; it draws nothing."""
         del key
-        action = jnp.clip(checks.one_action(action, (), "SharedFutures.step"), -1.0, 1.0)
+        action = jnp.clip(checks.one_action(action, (), "SharedFutures.step", clips=True), -1.0, 1.0)
         there = around(self.environment, params.futures, state.start, state.time + 1)
         motion, reward, terminated, terms = advance(self.environment, there, state.motion, action, state.time + 1)
         after = EnvState(_NO_LATENT, motion, state.start, state.time + 1, reward, terminated)
         return after, Transition(look(self.environment, there, motion), reward, terminated,
                                  after.time >= params.max_steps_in_episode, terms)
+
+    def restart(self, key: Array, state: EnvState, observation: Array, final: Array,
+                params: FuturesParams) -> tuple[EnvState, Array]:
+        """As Environment.restart."""
+        return episodes.restart(self, key, state, observation, final, params)

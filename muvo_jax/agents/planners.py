@@ -74,11 +74,11 @@ def cem(objective: Objective, key: Array, start: Array, config: PlannerConfig = 
 
     Returns the best plan seen.
     """
-    start = _checked(start)
+    start = jnp.clip(_checked(start), -1.0, 1.0)
     horizon, channels = start.shape
 
     def iterate(carry, key):
-        mean, std, elites, elite_values = carry
+        mean, std, elites, elite_values, best = carry
         key_noise, key_value = jax.random.split(key)
         noise = coloured_noise(key_noise, (config.plans, horizon, channels), config.noise_exponent)
         plans = jnp.clip(mean[None] + std[None] * noise, -1.0, 1.0).at[0].set(mean)
@@ -87,13 +87,14 @@ def cem(objective: Objective, key: Array, start: Array, config: PlannerConfig = 
         elite_values, index = jax.lax.top_k(values, config.elites)
         elites = plans[index]
         blend = lambda old, new: config.smoothing * old + (1.0 - config.smoothing) * new
-        return (blend(mean, elites.mean(axis=0)), blend(std, elites.std(axis=0)), elites, elite_values), None
+        return (blend(mean, elites.mean(axis=0)), blend(std, elites.std(axis=0)), elites, elite_values,
+                _better(best, plans, values)), None
 
-    first = (jnp.clip(start, -1.0, 1.0), jnp.full_like(start, config.std),
+    first = (start, jnp.full_like(start, config.std),
              jnp.zeros((config.elites, horizon, channels), jnp.float32),
-             jnp.full((config.elites,), -jnp.inf, jnp.float32))
-    (_, _, elites, values), _ = jax.lax.scan(iterate, first, jax.random.split(key, config.iterations))
-    return Plan(elites[0], values[0])
+             jnp.full((config.elites,), -jnp.inf, jnp.float32), Plan(start, jnp.float32(-jnp.inf)))
+    (*_, best), _ = jax.lax.scan(iterate, first, jax.random.split(key, config.iterations))
+    return best
 
 
 def mppi(objective: Objective, key: Array, start: Array, config: PlannerConfig = PlannerConfig()) -> Plan:
@@ -129,21 +130,23 @@ def gradient(objective: Objective, key: Array, start: Array, config: PlannerConf
         values = objective(key, plans)
         return values.sum(), values
 
-    def better(best, plans, values):
-        values = _finite(values)
-        index = values.argmax()
-        return jax.tree.map(lambda new, old: jnp.where(values[index] > best.value, new, old),
-                            Plan(plans[index], values[index]), best)
-
     def iterate(carry, key):
         plans, state, best = carry
         slopes, values = jax.grad(total, has_aux=True)(plans, key)
         updates, state = optimizer.update(-jnp.nan_to_num(slopes), state)
-        return (jnp.clip(plans + updates, -1.0, 1.0), state, better(best, plans, values)), None
+        return (jnp.clip(plans + updates, -1.0, 1.0), state, _better(best, plans, values)), None
 
     first = (plans, optimizer.init(plans), Plan(start, jnp.float32(-jnp.inf)))
     (plans, _, best), _ = jax.lax.scan(iterate, first, jax.random.split(key, config.iterations))
-    return better(best, plans, objective(jax.random.fold_in(key, config.iterations), plans))
+    return _better(best, plans, objective(jax.random.fold_in(key, config.iterations), plans))
+
+
+def _better(best: Plan, plans: Array, values: Array) -> Plan:
+    """The best of these plans [N, H, 2] and of the best before."""
+    values = _finite(values)
+    index = values.argmax()
+    return jax.tree.map(lambda new, old: jnp.where(values[index] > best.value, new, old),
+                        Plan(plans[index], values[index]), best)
 
 
 def _checked(start: Array) -> Array:

@@ -25,7 +25,7 @@ from flax import traverse_util
 
 from muvo_jax import run as run_lib
 from muvo_jax import safetensors_file
-from muvo_jax.agents import actor_critic, rewards
+from muvo_jax.agents import actor_critic
 from muvo_jax.agents import environment as environment_lib
 from muvo_jax.config import parsing
 from muvo_jax.types import Variables
@@ -33,7 +33,6 @@ from muvo_jax.types import Variables
 FOLDER = "agent"  # of a run, unless another place is named
 WEIGHTS, DESCRIPTION = "actor.safetensors", "agent.json"
 SCHEMA_VERSION = 1
-OBSERVATIONS = ("features", "road")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -111,12 +110,16 @@ def load(folder: str | os.PathLike, run: run_lib.Run) -> StoredPolicy:
         raise ValueError(f"{path} cannot be read ({type(error).__name__}: {error}); train the agent anew.") from error
     if version != SCHEMA_VERSION:
         raise ValueError(f"{path} has schema {version}, this version reads {SCHEMA_VERSION}; train the agent anew.")
+    if not isinstance(learned_in, Mapping):
+        raise ValueError(f"{folder / DESCRIPTION}: world_model is {str(learned_in)[:80]}, expected a table of what the "
+                         f"agent learned in. Train it again: python -m muvo_jax.train_agent.")
     _check_identity(learned_in, identity(run), folder, run)
     config = parsing.parse(actor_critic.ActorCriticConfig, described.get("actor_critic"), f"{path}: actor_critic")
     actor = traverse_util.unflatten_dict(
         {name: jnp.asarray(value) for name, value in safetensors_file.load(folder / WEIGHTS).items()}, sep="/")
-    if observation not in OBSERVATIONS:
-        raise ValueError(f"{path}: the agent observes {observation!r}, this version knows {', '.join(OBSERVATIONS)}.")
+    if observation not in environment_lib.OBSERVATIONS:
+        raise ValueError(f"{path}: the agent observes {observation!r}, this version knows "
+                         f"{', '.join(environment_lib.OBSERVATIONS)}.")
     stored = StoredPolicy(config, actor, training, observation)
     _check_network(stored, run, folder)
     return stored
@@ -151,9 +154,13 @@ def _check_identity(learned_in: Mapping[str, Any], here: Mapping[str, Any], fold
 
 
 def _environment(run, observation):
-    """Without collisions in its reward, for which models would need a head that the policy does not look at."""
-    return environment_lib.Environment.of_run(run, observation=observation,
-                                              reward_config=rewards.RewardConfig(collision=0.0))
+    """For what a policy observes. It rewards nothing: models would need heads that the policy does not look at."""
+    return environment_lib.Environment.of_run(run, observation=observation, reward_function=_no_reward, reward_heads=())
+
+
+def _no_reward(moment):
+    del moment
+    return 0.0, False, {}
 
 
 def _check_network(stored: StoredPolicy, run: run_lib.Run, folder: pathlib.Path) -> None:

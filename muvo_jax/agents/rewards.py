@@ -82,6 +82,9 @@ class RewardConfig:
 
     def __post_init__(self):
         limits.check(self)
+        if self.occupancy_scale not in (1, 2, 4):
+            raise ValueError(f"RewardConfig: occupancy_scale is {self.occupancy_scale}; expected 1, 2 or 4, the scales "
+                             f"at which the head occupancy is decoded.")
 
 
 @flax.struct.dataclass
@@ -250,13 +253,16 @@ def progress_m(moment: Moment, config: RewardConfig) -> Array:
 def discomfort(moment: Moment, contract: config_lib.ActionContract, step_s: float, config: RewardConfig) -> Array:
     """(a_along / a_ok)^2 + (v^2 curvature / a_ok)^2: accelerations along and across in units of `comfortable_mps2`.
 
-    Without a bicycle they come from the motion: change of speed and speed times turn, per second.
+    Without a bicycle they come from the motion: change of speed and speed times turn, per second. So does that along
+    where a car has come to stand, whose brake is no acceleration.
     """
+    along_as_moved = (moment.after.speed_mps - moment.before.speed_mps) / step_s
     if contract.kinematics == "bicycle":
-        along = motion_ops.acceleration_mps2(moment.action, contract)
+        along = jnp.where(moment.after.speed_mps > 0.0, motion_ops.acceleration_mps2(moment.action, contract),
+                          along_as_moved)
         across = moment.after.speed_mps**2 * motion_ops.curvature_per_m(moment.action, contract)
     else:
-        along = (moment.after.speed_mps - moment.before.speed_mps) / step_s
+        along = along_as_moved
         across = moment.after.speed_mps * (moment.after.pose[..., 2] - moment.before.pose[..., 2]) / step_s
     return (along**2 + across**2) / config.comfortable_mps2**2
 

@@ -51,7 +51,7 @@ class Caution:
         return reward * jnp.broadcast_to(share[jnp.clip(step - 1, 0, share.size - 1)], reward.shape)
 
     def feared(self, logits: Array) -> Array:
-        """Occupancy logits [..., 2] whose probability is the quantile of that of the branches [N, ..., 2]."""
+        """Occupancy logits [..., 2] whose log-odds are the quantile of those of the branches [N, ..., 2]."""
         if logits.shape[0] == 1:
             return logits[0]
         occupied = jnp.quantile((logits[..., 1] - logits[..., 0]).astype(jnp.float32), self.quantile, axis=0)

@@ -1,8 +1,10 @@
 """The actor-critic: lambda returns by hand, and learning what is easy to learn."""
 
+import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
+import worlds
 from worlds import make
 
 from muvo_jax.agents import actor_critic
@@ -56,3 +58,30 @@ def test_policies_of_one_config_compile_once_whatever_their_weights():
         rewards.append(transitions.reward)
         compiled.append(environment_lib._play._cache_size())
     assert compiled[0] == compiled[1] and not np.allclose(*rewards)
+
+
+def test_a_drive_that_is_cut_off_is_bootstrapped_there():
+    reward, value = jnp.array([1.0, 2.0, 4.0]), jnp.array([10.0, 20.0, 30.0])
+    truncated = jnp.array([False, True, False])
+    returns = actor_critic.lambda_returns(reward, jnp.full(3, 0.5), value, 0.9, truncated)
+    cut = 2.0 + 0.5 * 20.0
+    np.testing.assert_allclose(returns, [1.0 + 0.5 * (0.1 * 10.0 + 0.9 * cut), cut, 4.0 + 0.5 * 30.0])
+
+
+def test_steps_after_the_end_of_an_episode_teach_nothing():
+    config = actor_critic.ActorCriticConfig(width=8, layers=1, horizon=4, starts=2)
+    world, _ = worlds.make(reward_function=lambda moment: (moment.after.speed_mps, False, {}), reward_heads=())
+    learner = actor_critic.init(jax.random.key(0), world, config)
+    params = world.params(worlds.variables(), worlds.bank(), 2)
+    seen, drawn, transitions = actor_critic.imagine(world, config, params, jax.random.key(1), learner.actor)
+    assert transitions.truncated.tolist() == [[False, False], [True, True], [True, True], [True, True]]
+
+    def learned(reward):
+        drives = lambda actor: (seen, drawn, reward, transitions.terminated, transitions.truncated)
+        return actor_critic._learn(config, learner, drives, score=1.0)[0].critic
+
+    late = transitions.reward.at[2:].add(5.0)
+    chex.assert_trees_all_close(learned(transitions.reward), learned(late), rtol=1e-6)
+    early = transitions.reward.at[0].add(5.0)
+    assert any(np.abs(one - other).max() > 0 for one, other in zip(
+        jax.tree.leaves(learned(transitions.reward)), jax.tree.leaves(learned(early)), strict=True))

@@ -147,3 +147,12 @@ def test_what_cannot_be_planned_is_refused(options, message):
     environment, _ = worlds.make()
     with pytest.raises(ValueError, match=message):
         closed_loop.planning_driver(**{"simulator": road(), "environment": environment, "variables": {}} | options)
+
+
+def test_a_policy_is_not_driven_at_another_rate_and_no_driver_beyond_the_pedals():
+    world, _ = worlds.make()
+    slow = dataclasses.replace(road(), step_s=0.1)
+    with pytest.raises(ValueError, match=r"policy_driver: the simulator steps 0\.1 s, the model 0\.2 s"):
+        closed_loop.policy_driver(slow, world, worlds.variables(), lambda key, seen: jnp.zeros((1, 2)))
+    with pytest.raises(ValueError, match=r"the driver chose \[50\.0, 0\.0\]; expected two finite numbers in \[-1, 1\]"):
+        run(road(), closed_loop.constant_driver((50.0, 0.0)))

@@ -316,3 +316,21 @@ def test_a_library_that_is_first_imported_inside_a_trace_leaves_nothing_of_it(tm
     monkeypatch.syspath_prepend(tmp_path)
     assert jax.jit(lambda: optional.need("makes_arrays", "x").ONE + 1)() == 2
     assert int(optional.need("makes_arrays", "x").ONE) == 1
+
+
+def test_gymnax_refuses_what_is_no_number_before_it_compiles():
+    pytest.importorskip("gymnax", reason="gymnax is not installed")
+    from muvo_jax.agents.doors import gymnax_env
+    world, params = make()
+    door = gymnax_env.GymnaxImagination(world, params)
+    _, state = door.reset(jax.random.key(0), params)
+    with pytest.raises(ValueError, match=r"GymnaxImagination\.step: action \[2\] holds 1 values that are not finite"):
+        door.step(jax.random.key(1), state, np.array([np.nan, 0.0]), params)
+
+
+def test_a_door_of_one_car_refuses_horizons_of_several():
+    world, params = make()
+    several = dataclasses.replace(params, max_steps_in_episode=jnp.array([3, 4]))
+    with pytest.raises(ValueError, match=r"BraxImagination: max_steps_in_episode is \[2\], expected one number"):
+        BraxDoor((world, several))
+    optional.one_horizon("GymnasiumImagination", params)

@@ -7,7 +7,7 @@ import jax
 import numpy as np
 import pytest
 
-from muvo_jax import command_line, drive, presets, town_drive
+from muvo_jax import command_line, drive, drive_report, presets, town_drive
 from muvo_jax import config as config_lib
 from muvo_jax import run as run_lib
 from muvo_jax.agents import closed_loop, drive_scores, sensitivity
@@ -98,6 +98,19 @@ def test_geometry_alone_answers_to_the_wheel_as_the_town_does(town):
         assert found["gain"] > 0.1 and found["correlation"] > 0.1, (head, found)
 
 
+def test_a_model_that_shows_nothing_drives_without_pictures_of_what_it_imagines(town):
+    config = config_lib.override(presets.get("tiny"), "model.heads", ("action",))
+    world = town_drive.town_simulator(town, config)
+    done = closed_loop.drive(world, closed_loop.expert_driver(world), jax.random.key(0), town_drive.FIRST_SEED, 1,
+                             context=1)
+    moments = tuple(dataclasses.replace(moment, memory=object()) for moment in done.moments)
+    planned = dataclasses.replace(done, moments=moments)
+    blind = run_lib.Run(world_model.WorldModel(config.model), {}, config)
+    films = [drive_report.film(blind, town, one, jax.random.key(0), None, 2) for one in (done, planned)]
+    np.testing.assert_array_equal(*films)
+    assert drive_report.sensitivity_rows({"sensitivity": {"2": {"left or right": {}}}}) == []
+
+
 def test_help_shows_examples_and_explains_every_option(capsys):
     with pytest.raises(SystemExit) as ended:
         command_line.run(drive.Options, lambda *_: None, program="drive", arguments=["--help"],
@@ -153,3 +166,8 @@ def test_a_planner_that_sees_no_obstacles_says_so(town, capsys):
 def test_who_cannot_drive_is_refused_before_anyone_does(options, message, folder):
     with pytest.raises(ValueError, match=message):
         drive.drive(drive.Options(folder, **options), screen.Screen())
+
+
+def test_a_policy_that_no_agent_drives_is_refused(tmp_path):
+    with pytest.raises(ValueError, match=r"--policy=.* names none: add it, as in --agent=learned,planner"):
+        drive.drive(drive.Options(tmp_path, agent="planner", policy=tmp_path / "agent"), screen.Screen())

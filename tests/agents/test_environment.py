@@ -124,6 +124,8 @@ def test_what_does_not_fit_is_refused():
     blind = world_model.WorldModel(dataclasses.replace(CONFIG, heads=("image", "action")))
     with pytest.raises(ValueError, match="read the head occupancy, but this run trained image, action"):
         environment_lib.Environment(blind)
+    with pytest.raises(ValueError, match=r"observation is 'image', expected \"features\", \"road\" or a tuple"):
+        dataclasses.replace(make()[0], observation="image")
     environment, params = make()
     with pytest.raises(ValueError, match="horizon is 0"):
         make(horizon=0)
@@ -133,8 +135,6 @@ def test_what_does_not_fit_is_refused():
     _, state = environment.reset(jax.random.key(0), params)
     with pytest.raises(ValueError, match=r"action \[3\], expected \[2\]"):
         environment.step(jax.random.key(0), state, jnp.zeros(3), params)
-    with pytest.raises(ValueError, match="reach from 2 to 2"):
-        environment.step(jax.random.key(0), state, np.full((2,), 2.0), params)
     none = dataclasses.replace(environment.contract, kinematics="none")
     with pytest.raises(ValueError, match="or pass a reward_function"):
         dataclasses.replace(environment, contract=none)
@@ -178,3 +178,47 @@ def test_a_policy_that_loses_its_numbers_is_named_with_its_step():
     lost = jnp.zeros((2, 3, 4, 2)).at[1, 2, 3, 0].set(jnp.nan).at[1, 0, 1, 1].set(jnp.inf)
     with pytest.raises(ValueError, match=r"imagine: at step 1 of the drive \[1, 0\] the policy chose \[0.0, inf\]"):
         checks.chosen_actions(lost, "imagine")
+
+
+def test_what_lies_on_the_host_is_clipped_like_all_else_and_nan_is_refused():
+    environment, params = make()
+    _, state = environment.reset(jax.random.key(0), params)
+    far, edge = (environment.step(jax.random.key(1), state, action, params)[1].observation
+                 for action in (np.array([1.5, -7.0]), jnp.array([1.0, -1.0])))
+    np.testing.assert_array_equal(far, edge)
+    with pytest.raises(ValueError, match=r"Environment\.step: 1 values of the actions \[2\] are not finite"):
+        environment.step(jax.random.key(1), state, np.array([np.nan, 0.0]), params)
+    lost = dataclasses.replace(state, latent=jax.tree.map(lambda leaf: np.full(leaf.shape, np.nan, np.float32),
+                                                          state.latent))
+    with pytest.raises(ValueError, match=r"Environment\.step: state .* not finite"):
+        environment.step(jax.random.key(1), lost, ACTION, params)
+
+
+def test_a_plain_function_is_a_policy_and_horizons_are_counts():
+    environment, params = make()
+    _, state = environment.reset(jax.random.key(0), params)
+    policy = lambda key, seen: jnp.tanh(seen[:2])
+    plain, partial = (environment_lib.play(environment, params, jax.random.key(1), state, driver, 2)[1].reward
+                      for driver in (policy, jax.tree_util.Partial(policy)))
+    np.testing.assert_array_equal(plain, partial)
+    with pytest.raises(ValueError, match="play: horizon is -1; it must be at least 1"):
+        environment_lib.play(environment, params, jax.random.key(1), state, policy, -1)
+    with pytest.raises(ValueError, match="params: horizon is 0; it must be at least 1"):
+        environment.params(variables(), bank(), 0)
+
+
+def test_what_a_reward_or_an_observation_would_miss_is_told_at_once():
+    listed = environment_lib.Environment(MODEL, reward_config=NO_COLLISION, observation=["image"])
+    assert listed.observation == ("image",) and hash(listed)
+    with pytest.raises(ValueError, match=r"collisions in occupancy, which is not among reward_heads=\('image',\)"):
+        environment_lib.Environment(MODEL, reward_heads=("image",))
+
+
+def test_a_reward_of_plain_numbers_is_one():
+    environment = environment_lib.Environment(MODEL, periods=2, reward_heads=(),
+                                              reward_function=lambda moment: (1, False, {}))
+    params = environment.params(variables(), bank(), 2)
+    _, state = environment.reset(jax.random.key(0), params)
+    _, transitions = environment_lib.play(environment, params, jax.random.key(1), state, jnp.zeros((2, 2)), 2)
+    assert transitions.reward.tolist() == [1.0, 1.0] and transitions.reward.dtype == jnp.float32
+    assert not transitions.terminated.any()

@@ -159,3 +159,30 @@ def test_rewards_of_a_real_drive_by_hand():
     # braking with half of 6 m/s2 costs 0.05; 2 / 1.6 m divided by 10 / 8 earn 1, speeding costs 1/4
     want = [1.0 - 0.05, 1.0 - 0.25 - 20.0]
     np.testing.assert_allclose(real_rewards.town_rewards(world, Drive(3.6, 2, places, moments)), want, rtol=1e-6)
+
+
+def test_starts_that_are_not_there_and_a_policy_of_nan_are_named(imagined):
+    world, policy, _ = imagined
+    params = world.params({}, worlds.before_a_wall(16.0, 6.0, HORIZON)[1].bank, HORIZON)
+    imagine = lambda starts, policy=policy, horizon=2: futures_lib.imagine(
+        world, params, jax.random.key(0), jnp.asarray(starts), policy, horizon)
+    for starts in ([params.bank.size], [-1]):
+        with pytest.raises(ValueError, match=rf"starts \[1\] holds {starts[0]}; expected 0 to {params.bank.size - 1}"):
+            imagine(starts)
+    with pytest.raises(ValueError, match=r"starts is float32.*expected whole numbers"):
+        imagine([0.5])
+    with pytest.raises(ValueError, match=r"imagine: at step 0 of the drive \[0\] the policy chose \[nan, nan\]"):
+        imagine([0], lambda key, seen: jnp.full(2, jnp.nan))
+    with pytest.raises(ValueError, match=r"futures\.imagine: horizon is 0"):
+        imagine([0], horizon=0)
+
+
+def test_shared_futures_restart_where_a_drive_is_over(imagined):
+    world, _, futures = imagined
+    shared = futures_lib.SharedFutures(world)
+    params = shared.params(futures)
+    observation, state = shared.reset(jax.random.key(0), params)
+    moved, transition = shared.step(jax.random.key(1), state, jnp.zeros(2), params)
+    for final, time in ((False, 1), (True, 0)):
+        after, seen = shared.restart(jax.random.key(2), moved, transition.observation, jnp.bool_(final), params)
+        assert int(after.time) == time and seen.shape == observation.shape

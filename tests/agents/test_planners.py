@@ -124,3 +124,21 @@ def test_coloured_noise_has_unit_variance_and_is_smooth():
 def test_settings_that_make_no_sense_are_refused():
     with pytest.raises(ValueError, match="kept=9, elites=8"):
         planners.PlannerConfig(kept=9)
+
+
+@pytest.mark.parametrize("kept", [0, 2])
+def test_cem_returns_the_best_plan_it_saw_kept_or_not(kept):
+    """A narrow peak beside a wide slope: later iterations leave it."""
+    seen = []
+
+    def objective(key, plans):
+        values = jnp.where(jnp.abs(plans[:, 0, 0] - 0.5) < 0.05, 10.0, -jnp.abs(plans).mean(axis=(1, 2)))
+        jax.debug.callback(lambda values: seen.append(float(np.max(values))), values)
+        return values
+
+    for seed in range(6):
+        seen.clear()
+        config = planners.PlannerConfig(plans=64, kept=kept, noise_exponent=0.0)
+        plan = planners.cem(objective, jax.random.key(seed), jnp.zeros((5, 2)), config)
+        jax.effects_barrier()
+        assert plan.value == pytest.approx(max(seen))

@@ -9,9 +9,11 @@ import numpy as np
 import pytest
 from worlds import MODEL, variables
 
+from muvo_jax import config as config_lib
 from muvo_jax import presets, safetensors_file
 from muvo_jax import run as run_lib
 from muvo_jax.agents import actor_critic, policy_file, road
+from muvo_jax.model import world_model
 
 SETTINGS = actor_critic.ActorCriticConfig(width=8, layers=1, horizon=5)
 RUN = run_lib.Run(MODEL, variables(), presets.get("tiny"), step=7)
@@ -80,3 +82,10 @@ def test_what_is_no_agent_is_refused(actor, tmp_path):
     (folder / "actor.safetensors").write_bytes(b"nonsense")
     with pytest.raises(safetensors_file.SafetensorsError):
         policy_file.load(folder, RUN)
+
+
+def test_an_agent_of_a_reward_of_ones_own_comes_back_where_no_path_is_known(actor, tmp_path):
+    config = config_lib.override(presets.get("tiny"), "contract.kinematics", "none")
+    run = run_lib.Run(world_model.WorldModel(config.model), variables(), config, step=7)
+    policy_file.save(tmp_path, run, SETTINGS, actor, {"updates": 3})
+    assert policy_file.load(tmp_path, run).environment(run).observation == "features"

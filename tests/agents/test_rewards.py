@@ -255,3 +255,18 @@ def test_gradients_push_the_car_away_from_obstacles_and_towards_the_route():
     assert jax.grad(away)(jnp.zeros(3))[1] > 0  # the route is to the right
     along = jax.grad(lambda x: route.place(STRAIGHT, jnp.array([1.0, 0.0, 0.0]) * x)[0])(2.0)
     np.testing.assert_allclose(along, 1.0, rtol=0.02)
+
+
+@pytest.mark.parametrize("action", [(-1.0, 0.0), (-0.5, 0.3), (0.0, 0.0)])
+def test_a_car_that_stands_pays_nothing_for_holding_its_brake(action):
+    np.testing.assert_array_equal(rewards.discomfort(moment(0.0, action), CONTRACT, 0.2, CONFIG), 0.0)
+
+
+def test_a_car_that_comes_to_stand_pays_for_how_it_slowed_down_not_for_its_pedal():
+    found = rewards.discomfort(moment(0.3, (-1.0, 0.0)), CONTRACT, 0.2, CONFIG)
+    np.testing.assert_allclose(found, (0.3 / 0.2 / 3.0) ** 2, rtol=1e-5)
+
+
+def test_a_scale_at_which_nothing_is_decoded_is_refused():
+    with pytest.raises(ValueError, match="occupancy_scale is 3; expected 1, 2 or 4"):
+        rewards.RewardConfig(occupancy_scale=3)

@@ -24,6 +24,7 @@ class BraxImagination(Base):
     """The core as a brax Env; decoded sensors come as a dict by head."""
 
     def __init__(self, core: environment_lib.Environment, params: environment_lib.EnvParams):
+        optional.one_horizon("BraxImagination", params)
         self.core = core
         self._params = params
 

@@ -76,6 +76,7 @@ class GymnasiumImagination(Env):
     def __init__(self, core: environment_lib.Environment, params: environment_lib.EnvParams,
                  render_mode: str | None = None):
         _check_rendered(core, render_mode)
+        optional.one_horizon("GymnasiumImagination", params)
         self.core, self.render_mode = core, render_mode
         self.metadata = self.metadata | {"render_fps": 1.0 / core.step_s}
         self.params = params
@@ -147,6 +148,9 @@ def camera_picture(core: environment_lib.Environment, params: environment_lib.En
 def _check_rendered(core, render_mode):
     if render_mode is not None and render_mode not in RENDER_MODES:
         raise ValueError(f"render_mode is {render_mode!r}; expected {' or '.join(map(repr, RENDER_MODES))} or None.")
+    if render_mode is not None and not hasattr(core, "model"):
+        raise ValueError(f"render_mode={render_mode!r} decodes latents, and futures that were imagined before have "
+                         f"none; pass None, or the environment itself.")
     if render_mode is not None and "image" not in core.model.config.heads:
         raise ValueError(f"render_mode={render_mode!r} shows the decoded camera image, but this run trained "
                          f"{', '.join(core.model.config.heads)}. Train the head (--with-heads=image), or pass None.")

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 
 from muvo_jax.agents import environment as environment_lib
 from muvo_jax.agents.doors import optional
+from muvo_jax.model import checks
 
 Base: Any = optional.need("gymnax.environments.environment", "gymnax").Environment
 gymnax_spaces: Any = optional.need("gymnax.environments.spaces", "gymnax")
@@ -29,6 +30,11 @@ class GymnaxImagination(Base):
     @property
     def default_params(self) -> environment_lib.EnvParams:
         return self._params
+
+    def step(self, key, state, action, params=None):
+        # Gymnax compiles `step`: inside, nothing lies on the host any more.
+        checks.finite_on_host("GymnaxImagination.step", action=action, state=state)
+        return super().step(key, state, action, params)
 
     def reset_env(self, key, params):
         return self.core.reset(key, params)

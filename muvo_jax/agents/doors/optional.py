@@ -6,6 +6,7 @@ import importlib
 from typing import Any
 
 import jax
+import numpy as np
 
 
 def need(module: str, extra: str) -> Any:
@@ -23,3 +24,11 @@ def need(module: str, extra: str) -> Any:
     except ImportError as error:
         raise ImportError(f"{module} cannot be imported ({error}); this door needs the extra [{extra}]: "
                           f"pip install 'muvo_jax[{extra}]'") from error
+
+
+def one_horizon(where: str, params: Any) -> None:
+    """Raises ValueError for horizons of several cars: such a door drives one, and its wrappers take one number."""
+    shape = np.shape(params.max_steps_in_episode)
+    if shape:
+        raise ValueError(f"{where}: max_steps_in_episode is {list(shape)}, expected one number. Cars with horizons of "
+                         f"their own drive in the environment itself, under jax.vmap.")

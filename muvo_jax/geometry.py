@@ -9,6 +9,7 @@ from typing import Annotated
 from muvo_jax.limits import COUNT, NOT_NEGATIVE, RangeError, above, between, check
 
 ELEVATION_RAD = between(-0.5 * math.pi, 0.5 * math.pi, "rad")
+_MOST_VOXELS = 1 << 30
 MOUNTING_M = between(-30, 30, "m")  # of a sensor on a car or truck
 
 
@@ -22,8 +23,8 @@ class RangeViewGeometry:
       position_m: where the lidar sits in the ego frame.
     """
 
-    rows: Annotated[int, COUNT] = 64
-    columns: Annotated[int, COUNT] = 1024
+    rows: Annotated[int, between(1, 4096)] = 64
+    columns: Annotated[int, between(1, 65536)] = 1024
     elevation_min_rad: Annotated[float, ELEVATION_RAD] = -0.5235987755982988  # -30 degrees
     elevation_max_rad: Annotated[float, ELEVATION_RAD] = 0.17453292519943295  # +10 degrees
     position_m: Annotated[tuple[float, float, float], MOUNTING_M] = (1.0, 0.0, 2.0)
@@ -46,6 +47,8 @@ class VoxelGrid:
 
     def __post_init__(self):
         check(self)
+        if math.prod(self.shape) > _MOST_VOXELS:
+            raise RangeError("VoxelGrid", "shape", f"is {self.shape!r}; at most {_MOST_VOXELS} voxels fit a frame.")
 
     def layers(self, low_m: float, high_m: float = math.inf) -> slice:
         """Those of the last axis whose lower faces lie from `low_m` on and below `high_m` over the ground."""

@@ -99,8 +99,15 @@ def check(instance: Any) -> None:
                     whole and not isinstance(number, numbers.Integral)):
                 kind = "whole numbers" if whole else "numbers"
                 raise RangeError(cls.__name__, name, f"is {value!r}; expected {kind}.")
-            if not limits.holds(float(number)):
+            if not _holds(limits, number):
                 raise RangeError(cls.__name__, name, f"is {value!r}; it must be {limits}.")
+
+
+def _holds(limits: Limits, number: Any) -> bool:
+    try:
+        return limits.holds(float(number))
+    except OverflowError:  # a whole number that no float can be
+        return False
 
 
 def _numbers(value: Any) -> typing.Iterator[Any]:

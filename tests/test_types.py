@@ -38,6 +38,34 @@ def test_latent_states_index_like_arrays_and_put_h_first():
     np.testing.assert_array_equal(state.features[0, 0], [1, 1, 0])
 
 
+def test_an_index_of_observed_frames_keeps_all_that_was_remembered():
+    numbers = lambda *shape: np.arange(np.prod(shape), dtype=np.float32).reshape(shape)
+    gaussian = types.Gaussian(numbers(2, 5, 3), numbers(2, 5, 3))
+    memory = types.Memory(pose=numbers(2, 4, 3), range_view=numbers(2, 4, 2, 2, 4), intrinsics=numbers(2, 3, 3),
+                          camera_to_ego=numbers(2, 4, 4))
+    observed = types.Observed(types.LatentState(numbers(2, 5, 3), numbers(2, 5, 3)), gaussian, gaussian, memory)
+    same = lambda got, want: jax.tree.map(np.testing.assert_array_equal, got, want)
+    for index in (np.s_[:, -3:], np.s_[:, 2], np.s_[...], np.s_[:]):
+        same(observed[index].memory, memory)
+        same(observed[index].states, observed.states[index])
+        same(observed[index].prior, gaussian[index])
+    same(observed[1:, :3].memory, memory[1:])
+    same(observed[0].memory, memory[0])
+    assert observed.replace(memory=None)[:, :2].memory is None
+
+
+def test_an_index_of_a_batch_keeps_the_calibration_whole():
+    calibration = np.arange(2 * 9, dtype=np.float32).reshape(2, 3, 3)
+    windows = batch(intrinsics=calibration, speed_mps=np.arange(10, dtype=np.float32).reshape(2, 5))
+    later = windows[:, 3:].validate()
+    assert later.frames == 2 and later.image is None
+    np.testing.assert_array_equal(later.intrinsics, calibration)
+    np.testing.assert_array_equal(later.speed_mps, [[3, 4], [8, 9]])
+    second = windows[1:, :2].validate()
+    np.testing.assert_array_equal(second.intrinsics, calibration[1:])
+    np.testing.assert_array_equal(windows[1].intrinsics, calibration[1])
+
+
 def predictions():
     """[3, 8, 4, 1] at full size; the head `continue` has no other."""
     image = {scale: jnp.full((3, 8 // scale, 4 // scale, 1), scale, jnp.float32) for scale in (1, 2)}

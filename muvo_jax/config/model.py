@@ -61,8 +61,8 @@ class ModelConfig:
         step that they cause enter the recurrence too, and the start of every token. Without it a prior that reads one
         action among many tokens learns to ignore it.
       kinematics: what actions do, where they describe the motion; Config fills it in from contract and stride.
-      range_view_points: "beams": x, y, z are drawn as the difference from the point along the pixel's beam. With "free"
-        a decoder must learn the geometry of the sensor first.
+      range_view_points: "beams": x, y, z are drawn and learned as the difference from the point along the pixel's beam.
+        With "free" a decoder must learn the geometry of the sensor first.
       occupied_above: a voxel is called occupied where its probability is above this. Most voxels are empty, and the
         decision that overlaps best is below one half: at the intersection over union J that it reaches, J / (1 + J).
       compute_dtype: of the matrix work; parameters, norms, softmax and losses stay float32.

@@ -11,6 +11,8 @@ from typing import Any
 from muvo_jax.config import migration, parsing, parts, sizes
 from muvo_jax.config.whole import Config
 
+_FILLED_IN = "model.kinematics"  # by Config
+
 
 def override(config: Config, dotted: str, value: Any) -> Config:
     """`override_all` with one setting: `override(config, "model.fusion.dropout", 0.0)`."""
@@ -28,12 +30,15 @@ def override_all(config: Config, settings: Mapping[str, Any]) -> Config:
 
     Raises:
       ValueError: for an unknown name (naming the nearest known one), a name of earlier versions (naming today's), a
-        setting that only another kind of part has, or a value of the wrong type.
+        setting that follows from others or that only another kind of part has, or a value of the wrong type.
     """
     values = dataclasses.asdict(config)
     for dotted in sorted(settings, key=lambda name: name.count(".")):  # a part is chosen before its settings
         if today := migration.new_name(dotted):
             raise ValueError(f"{dotted} is called {today} now: parts of the model have settings of their own.")
+        if f"{dotted}.".startswith(f"{_FILLED_IN}."):
+            raise ValueError(f"{dotted} follows from contract, which the recording says, and data.stride: a value of "
+                             f"its own would not count. Leave it out.")
         try:
             _set(values, Config, "", dotted.split("."), settings[dotted], config.preset)
         except _UnknownError as error:
@@ -52,7 +57,8 @@ def names(values: Mapping[str, Any], above: str = "") -> dict[str, Any]:
 def _hint(dotted: str, config: Config) -> str:
     """The settings whose last name is like that of an unknown one, those of its section before others."""
     section, last = dotted.partition(".")[0], dotted.rpartition(".")[2]
-    known = sorted(names(dataclasses.asdict(config)), key=lambda name: not name.startswith(f"{section}."))
+    free = (name for name in names(dataclasses.asdict(config)) if not name.startswith(_FILLED_IN))
+    known = sorted(free, key=lambda name: not name.startswith(f"{section}."))
     by_last: dict[str, str] = {}
     for name in known:
         by_last.setdefault(name.rpartition(".")[2], name)
@@ -74,6 +80,9 @@ def _set(node: dict[str, Any], cls: Any, at: str, below: Sequence[str], value: A
     here, hint = f"{at}.{name}".removeprefix("."), typing.get_type_hints(cls)[name]
     kinds = parts.kinds(hint)
     if not rest:
+        if dataclasses.is_dataclass(hint) and isinstance(value, Mapping):  # its other fields would be the defaults
+            raise ValueError(f"{here} is a section of settings, not one: set what is in it, such as "
+                             f"{here}.{next(iter(node[name]))}.")
         node[name] = _chosen(kinds, node[name], preset, here, value) if kinds else value
         return
     if kinds:

@@ -53,7 +53,7 @@ class DataConfig:
       key_frames: only these, where a recording has them (nuScenes: 2 a second instead of 10).
       frames, stride: a training window is `frames` frames, each `stride` recorded frames apart.
       context, horizon: evaluation observes `context` frames and imagines `horizon` more.
-      town_seed, town_size: which town, and how much of it ("default", "large", "tiny").
+      town_seed, town_size: which town, and how much of it.
       cache_gib: decoded frames are kept in memory up to this size.
       workers: threads that read and decode batches ahead; 0 takes one for each processor but one, 2 to 16.
       skip_corrupt_shards: leave damaged shards of a packed recording out, counted, instead of stopping.
@@ -68,7 +68,7 @@ class DataConfig:
     context: Annotated[int, COUNT] = 6
     horizon: Annotated[int, COUNT] = 6
     town_seed: Annotated[int, SEED] = 0
-    town_size: str = "default"
+    town_size: Literal["default", "large", "tiny"] = "default"
     cache_gib: Annotated[float, NOT_NEGATIVE] = 1.5
     workers: Annotated[int, NOT_NEGATIVE] = 0
     skip_corrupt_shards: bool = False

@@ -30,6 +30,14 @@ def along_beams(raw: types.Array, scale: int, config: ModelConfig) -> types.Arra
     return jnp.concatenate([points, ranges], axis=-1)
 
 
+def _apart(view: types.Array, scale: int, config: ModelConfig) -> types.Array:
+    """How far the points of a range view [..., Hr/scale, Wr/scale, 4] lie from their pixels' beams [..., 3], m."""
+    geometry, lead = config.range_view, (1,) * (view.ndim - 3)
+    beams = range_view.beam_directions(geometry)[::scale, ::scale]
+    position_m = np.asarray(geometry.position_m, np.float32).reshape(*lead, 1, 1, 3)
+    return view[..., :3] - beams.reshape(*lead, *beams.shape) * view[..., 3:] - position_m
+
+
 def _finish(value: types.Array, scale: int, config: ModelConfig) -> types.Array:
     """In metres."""
     if config.range_view_points == "beams":
@@ -39,13 +47,23 @@ def _finish(value: types.Array, scale: int, config: ModelConfig) -> types.Array:
 
 def _losses(learned: head.Learned) -> dict[str, head.Sums]:
     model, loss, truth = learned.model, learned.loss, learned.truth("range_view")
-    sums: dict[str, head.Sums] = {}
+    beams, sums = model.range_view_points == "beams", dict[str, head.Sums]()
     for scale, target in labels.range_view_labels(truth).items():
+        prediction = learned.predictions[scale]
+        if beams:
+            # The L2 of points would learn the range too, as a mean: between the two sides of an edge, where nothing is.
+            prediction, target = (jnp.concatenate([_apart(view, scale, model), view[..., 3:]], axis=-1)
+                                  for view in (prediction, target))
         sums[f"range_xyz_{scale}"], sums[f"range_depth_{scale}"] = regression.range_view_sums(
-            learned.predictions[scale], target, scale_m=model.range_scale_m, mask_holes=model.numerics == "standard")
+            prediction, target, scale_m=model.range_scale_m, mask_holes=model.numerics == "standard")
     if loss.chamfer:
+        prediction = learned.predictions[1]
+        if beams:  # and a neighbour that is nearer must not pull a point off its beam
+            apart = _apart(prediction, 1, model)
+            points = prediction[..., :3] - apart + jax.lax.stop_gradient(apart)
+            prediction = jnp.concatenate([points, prediction[..., 3:]], axis=-1)
         sums["chamfer_1"] = chamfer.chamfer_sums(
-            learned.predictions[1], truth, learned.keys, points=loss.chamfer_points, scale_m=model.range_scale_m,
+            prediction, truth, learned.keys, points=loss.chamfer_points, scale_m=model.range_scale_m,
             return_threshold_m=loss.return_threshold_m)
     return sums
 

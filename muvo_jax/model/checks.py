@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from muvo_jax.model.encoders import COMMANDS
 from muvo_jax.model.world_model import WorldModel, inputs
 from muvo_jax.ops import conv
 from muvo_jax.types import Batch, LatentState
@@ -61,11 +62,14 @@ def actions(given, lead: tuple[int, ...], horizon: int | None, branches: int | N
     return (shape[rank] if has_branches else branches), shape[-2]
 
 
-def one_action(given, lead: tuple[int, ...], where: str, name: str = "action") -> jax.Array:
+def one_action(given, lead: tuple[int, ...], where: str, name: str = "action", *, clips: bool = False) -> jax.Array:
     """Returns the action [*lead, 2] of one step as float32.
 
     Values on the host (NumPy, lists) are looked at. Those on a device are clipped to [-1, 1] there instead: to look at
     them the host would wait, at every step of a loop, for the device to catch up. Traced values pass.
+
+    Args:
+      clips: whether the caller clips all values, so that those on the host need only be finite.
 
     Raises:
       ValueError: for another shape, or for values on the host that are not finite or outside [-1, 1].
@@ -77,7 +81,7 @@ def one_action(given, lead: tuple[int, ...], where: str, name: str = "action") -
     if isinstance(given, jax.Array):
         on_device = given.astype(jnp.float32)
         return on_device if isinstance(given, jax.core.Tracer) else jnp.clip(on_device, -1.0, 1.0)
-    action_values(given, where)
+    action_values(np.clip(given, -1.0, 1.0) if clips else given, where)  # NaN stays
     return jnp.asarray(given, jnp.float32)
 
 
@@ -112,7 +116,31 @@ def chosen_actions(given, where: str) -> None:
 
 
 def finite(where: str, **named) -> None:
-    """Raises ValueError where a concrete array holds NaN or infinity, naming it; traced values and integers pass."""
+    """Raises ValueError where a concrete array holds NaN or infinity, naming it; traced values and integers pass.
+
+    Of `points`, beside a `point_count`, only so many rows are looked at.
+    """
+    _finite(where, _without_padding(named, unseen=jax.core.Tracer))
+
+
+def finite_on_host(where: str, **named) -> None:
+    """As `finite`, but arrays on a device pass: in a step of a loop the host would wait to look at them."""
+    _finite(where, {name: [leaf for leaf in jax.tree.leaves(tree) if not isinstance(leaf, jax.Array)]
+                    for name, tree in _without_padding(named, unseen=jax.Array).items()})
+
+
+def _without_padding(named: dict, unseen: type) -> dict:
+    """The same with 0 in the rows of `points` beyond `point_count`; without points where one of both is `unseen`."""
+    if not {"points", "point_count"} <= named.keys():
+        return named
+    if isinstance(named["points"], unseen) or isinstance(named["point_count"], unseen):
+        return {name: value for name, value in named.items() if name != "points"}
+    points, count = np.asarray(named["points"]), np.asarray(named["point_count"])
+    padding = np.arange(points.shape[-2]) >= np.expand_dims(count, -1)
+    return named | {"points": np.where(np.expand_dims(padding, -1), np.zeros((), points.dtype), points)}
+
+
+def _finite(where: str, named: dict) -> None:
     for name, tree in named.items():
         for leaf in jax.tree.leaves(tree):
             if isinstance(leaf, jax.core.Tracer) or not jnp.issubdtype(jnp.result_type(leaf), jnp.floating):
@@ -122,17 +150,24 @@ def finite(where: str, **named) -> None:
                 raise ValueError(f"{where}: {name} {list(jnp.shape(leaf))} holds {wrong} values that are not finite.")
 
 
-def finite_on_host(where: str, **named) -> None:
-    """As `finite`, but arrays on a device pass: in a step of a loop the host would wait to look at them."""
-    finite(where, **{name: [leaf for leaf in jax.tree.leaves(tree) if not isinstance(leaf, jax.Array)]
-                     for name, tree in named.items()})
-
-
 def observation(where: str, model: WorldModel, batch: Batch) -> None:
-    """Raises ValueError where an input of the model, or an action, is concrete and not finite."""
+    """Raises ValueError where an input of the model, or an action, is concrete and not finite, or no known command."""
     read = {"action": batch.action, "range_view": batch.range_view}
     read |= {name: getattr(batch, name) for name in inputs(model.config)}
     finite(where, **{name: value for name, value in read.items() if value is not None})
+    for name in ("command", "next_command"):
+        known_commands(where, name, read.get(name))
+
+
+def known_commands(where: str, name: str, given) -> None:
+    """Raises ValueError where commands of the navigation are concrete and none; None and traced values pass."""
+    if given is None or isinstance(given, jax.core.Tracer):
+        return
+    values = np.asarray(given)
+    wrong = values[(values < 0) | (values >= COMMANDS)]
+    if wrong.size:
+        raise ValueError(f"{where}: {name} {list(values.shape)} holds {wrong[0]}; expected 0 to {COMMANDS - 1} (left, "
+                         f"right, straight, follow the lane, change to the left, change to the right).")
 
 
 def forward_mode(where: str, model: WorldModel, *trees) -> None:
@@ -152,21 +187,21 @@ def forward_mode(where: str, model: WorldModel, *trees) -> None:
             leaf = getattr(leaf, "primal", getattr(leaf, "val", None))
 
 
-def counts(horizon: int | None, branches: int | None) -> int:
+def counts(horizon: int | None, branches: int | None, where: str = "imagine") -> int:
     """Returns the horizon.
 
     Raises:
       ValueError: if there is none, or it or the number of branches is below 1.
     """
     if horizon is None:
-        raise ValueError("imagine: a policy needs a horizon; pass horizon=number of steps.")
+        raise ValueError(f"{where}: a policy needs a horizon; pass horizon=number of steps.")
     for name, count in (("horizon", horizon), ("branches", branches)):
         if count is not None and (isinstance(count, bool) or not isinstance(count, numbers.Integral)):
-            raise ValueError(f"imagine: {name} is {count!r}; expected a whole number.")
+            raise ValueError(f"{where}: {name} is {count!r}; expected a whole number.")
     if horizon < 1:
-        raise ValueError(f"imagine: horizon is {horizon}; it must be at least 1.")
+        raise ValueError(f"{where}: horizon is {horizon}; it must be at least 1.")
     if branches is not None and branches < 1:
-        raise ValueError(f"imagine: branches is {branches}; it must be at least 1.")
+        raise ValueError(f"{where}: branches is {branches}; it must be at least 1.")
     return horizon
 
 

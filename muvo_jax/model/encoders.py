@@ -200,7 +200,7 @@ class SpeedEncoder(linen.Module):
 
 
 class CommandEncoder(linen.Module):
-    """A navigation command int32 [N], 0 to 5 -> [N, C]."""
+    """A navigation command int32 [N], 0 to 5 -> [N, C]; another counts as the nearest of these."""
 
     config: ModelConfig
 
@@ -210,7 +210,7 @@ class CommandEncoder(linen.Module):
         embedding = self.param("embedding", layers.shape_only, (COMMANDS, channels))
         out = channels if isinstance(self.config.latent, config_lib.VectorLatent) else _measured_channels(self.config)
         return jax.nn.relu(layers.Mlp((channels, out), layers.Compute.of(self.config), name="mlp")(
-            jnp.take(embedding, command, axis=0)))
+            jnp.take(embedding, jnp.clip(command, 0, COMMANDS - 1), axis=0)))
 
 
 class TargetEncoder(linen.Module):

@@ -78,6 +78,9 @@ def observe_step(model: WorldModel, variables: Variables, live: LiveState, obser
     batch.validate()
     checks.finite_on_host("observe_step", state=live.latent, **{
         name: value for name, value in observation.items() if name in {*inputs(model.config), "range_view"}})
+    for name in ("command", "next_command"):
+        if not isinstance(given := observation.get(name), jax.Array):
+            checks.known_commands("observe_step", name, given)
     checks.forward_mode("observe_step", model, variables, live.latent, batch)
     return _observe_step(model, variables, live, batch, sampled)
 

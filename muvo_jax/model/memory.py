@@ -176,6 +176,7 @@ def check(config: ModelConfig, states: LatentState | Array, memory: Memory | Non
     flat = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[len(lead):]), states.vantage)
     count = flat.last.shape[0]
     if rows is not None:
+        check_indices("decode", "rows", rows, drives, "which drive of the memory a state belongs to")
         rows = jnp.asarray(rows, jnp.int32)
         if rows.shape != lead:
             raise ValueError(f"decode: got rows {list(rows.shape)}, expected {list(lead)}, a drive for each state.")
@@ -184,6 +185,18 @@ def check(config: ModelConfig, states: LatentState | Array, memory: Memory | Non
         raise ValueError(f"decode: got states [{', '.join(map(str, (*lead, '...')))}] and a memory of {drives} drives; "
                          f"the first axis of the states must count the drives. Pass rows= otherwise.")
     return flat, jnp.repeat(jnp.arange(drives, dtype=jnp.int32), count // drives)
+
+
+def check_indices(where: str, name: str, given, count: int, what: str) -> None:
+    """Raises ValueError where concrete indices are no whole numbers from 0 to count - 1; traced values pass."""
+    if isinstance(given, jax.core.Tracer):
+        return
+    values = np.asarray(given)
+    if not np.issubdtype(values.dtype, np.integer):
+        raise ValueError(f"{where}: {name} is {values.dtype}{list(values.shape)}, expected whole numbers, {what}.")
+    wrong = values[(values < 0) | (values >= count)]
+    if wrong.size:
+        raise ValueError(f"{where}: {name} {list(values.shape)} holds {wrong[0]}; expected 0 to {count - 1}, {what}.")
 
 
 def check_sizes(where: str, config: ModelConfig, memory: Memory) -> None:

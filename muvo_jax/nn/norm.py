@@ -38,7 +38,10 @@ class BatchNorm(linen.Module):
 
     @linen.compact
     def __call__(self, x: jax.Array, mode: Mode, mask: jax.Array | None = None) -> jax.Array:
-        """mask: bool [...], which rows the moments are taken over; None means all."""
+        """mask: bool [...], which rows the moments are taken over; None means all.
+
+        Without rows on any device the running moments stay, with a single one the running variance does.
+        """
         channels = x.shape[-1]
         scale = self.param("scale", layers.shape_only, (channels,))
         bias = self.param("bias", layers.shape_only, (channels,))
@@ -47,10 +50,11 @@ class BatchNorm(linen.Module):
         x32 = x.astype(jnp.float32)
         mean, var = running_mean.value, running_var.value
         if mode.train:
-            mean, var, unbiased_var = batch_moments(x32, mode.axis_name, mask)
+            mean, var, unbiased_var, count = batch_moments(x32, mode.axis_name, mask)
             if not self.is_initializing():
-                running_mean.value += self.momentum * (jax.lax.stop_gradient(mean) - running_mean.value)
-                running_var.value += self.momentum * (jax.lax.stop_gradient(unbiased_var) - running_var.value)
+                for running, value, needed in ((running_mean, mean, 1.0), (running_var, unbiased_var, 2.0)):
+                    change = self.momentum * (jax.lax.stop_gradient(value) - running.value)
+                    running.value += jnp.where(count >= needed, change, 0.0)
         factor = scale * jax.lax.rsqrt(var + self.epsilon)
         rank = x.ndim
         y = (x32 - layers.per_channel(mean, rank)) * layers.per_channel(factor, rank) + layers.per_channel(bias, rank)
@@ -58,23 +62,23 @@ class BatchNorm(linen.Module):
 
 
 def batch_moments(x: jax.Array, axis_name: str | None,
-                  mask: jax.Array | None = None) -> tuple[jax.Array, jax.Array, jax.Array]:
+                  mask: jax.Array | None = None) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
     """Mean, biased and unbiased variance, each [C], of x [..., C] over all leading axes and over the mapped axis.
 
-    With a mask [...], of the rows where it is true.
+    With a mask [...], of the rows where it is true. Beside them the float32 number of rows; without any the moments
+    are 0, as is the variance of one.
     """
     total = lambda value: value if axis_name is None else jax.lax.psum(value, axis_name)
     axes = tuple(range(x.ndim - 1))
     kept = None if mask is None else jnp.expand_dims(mask, -1)
     over_rows = lambda value: total(jnp.sum(value if kept is None else jnp.where(kept, value, 0.0), axes))
     count = total(jnp.float32(math.prod(x.shape[:-1])) if mask is None else jnp.sum(mask).astype(jnp.float32))
-    if mask is not None:
-        count = jnp.maximum(count, 1.0)
-    mean = over_rows(x) / count
+    divisor = count if mask is None else jnp.maximum(count, 1.0)
+    mean = over_rows(x) / divisor
     # The derivative of the squares by the mean is sum(x - mean) = 0: leaving it out saves a reduction backwards.
     centre = layers.per_channel(jax.lax.stop_gradient(mean), x.ndim)
     squares = over_rows(jnp.square(x - centre))
-    return mean, squares / count, squares / jnp.maximum(count - 1.0, 1.0)
+    return mean, squares / divisor, squares / jnp.maximum(count - 1.0, 1.0), count
 
 
 def _centred(x: jax.Array, axes: tuple[int, ...], epsilon: float) -> tuple[jax.Array, jax.Array]:

@@ -23,7 +23,7 @@ def cross_entropy_sums(logits: types.Array, target: types.Array, *, weights: tup
 
     Args:
       logits: float [B, T, *S, classes].
-      target: integers [B, T, *S]; 255 does not count.
+      target: integers [B, T, *S]; 255, and what is no class of the logits, does not count.
       weights: of each class; empty for 1.
       top_share: of each frame only the int(share * pixels) largest losses count.
       poly: adds poly * (1 - exp(-loss)) to each pixel's loss.
@@ -36,7 +36,7 @@ def cross_entropy_sums(logits: types.Array, target: types.Array, *, weights: tup
         raise ValueError(f"cross-entropy: {len(weights)} class weights for {classes} classes; give one a class.")
     frames, pixels = math.prod(target.shape[:2]), math.prod(target.shape[2:])
     target = target.reshape(frames, pixels).astype(jnp.int32)
-    known = target != UNLABELLED
+    known = (target >= 0) & (target < classes) & (target != UNLABELLED)
     index = jnp.where(known, target, 0)
     logarithm = jax.nn.log_softmax(logits.astype(jnp.float32).reshape(frames, pixels, classes), axis=-1)
     loss = -jnp.take_along_axis(logarithm, index[..., None], axis=-1)[..., 0]

@@ -19,7 +19,7 @@ def nearest_distance(points, targets, target_mask=None, *, chunk: int = 64):
     Args:
       points: float [P, D], any unit.
       targets: float [Q, D], of the dtype of points.
-      target_mask: bool [Q], false for targets to ignore; None takes all.
+      target_mask: bool [Q], false for targets to ignore, which may hold anything; None takes all.
       chunk: points handled at once; a chunk needs memory for chunk * Q distances.
 
     Returns:
@@ -36,6 +36,7 @@ def nearest_distance(points, targets, target_mask=None, *, chunk: int = 64):
         target_mask = jnp.ones(targets.shape[:1], bool)
     if target_mask.shape != targets.shape[:1]:
         raise ValueError(f"nearest_distance: target_mask is {target_mask.shape}, expected {targets.shape[:1]}.")
+    targets = _without_masked(targets, target_mask)
     index = nearest_index(points, targets, target_mask, chunk=chunk)
     difference = points - targets[index]
     squared = jnp.sum(difference * difference, axis=-1)
@@ -47,7 +48,7 @@ def nearest_distance(points, targets, target_mask=None, *, chunk: int = 64):
 
 def nearest_index(points, targets, target_mask, *, chunk: int = 64):
     """int32 [P]: which valid target is nearest to each point (the first of equals, 0 where none is valid)."""
-    points, targets = lax.stop_gradient(points), lax.stop_gradient(targets)
+    points, targets = lax.stop_gradient(points), lax.stop_gradient(_without_masked(targets, target_mask))
     count, dimensions = points.shape
     chunk = min(chunk, max(count, 1))
     chunks = -(-count // chunk)
@@ -73,12 +74,13 @@ def chamfer_sums(points, targets, point_mask, target_mask, *, chunk: int = 64) -
 
     Args:
       points, targets: float [P, D] and [Q, D].
-      point_mask, target_mask: bool [P] and [Q], the valid ones.
+      point_mask, target_mask: bool [P] and [Q], the valid ones; the others may hold anything.
 
     Returns:
       forward sum, forward count, backward sum, backward count: scalars of the dtype of points. Forward goes from points
       to targets. All are zero where either set has no valid point, which is an undefined distance.
     """
+    points, targets = _without_masked(points, point_mask), _without_masked(targets, target_mask)
     defined = jnp.any(point_mask) & jnp.any(target_mask)
     sums = []
     for source, mask, other, other_mask in ((points, point_mask, targets, target_mask),
@@ -88,6 +90,11 @@ def chamfer_sums(points, targets, point_mask, target_mask, *, chunk: int = 64) -
         sums.append(jnp.sum(jnp.where(counted, distance, jnp.zeros_like(distance))))
         sums.append(jnp.sum(counted).astype(distance.dtype))
     return tuple(sums)
+
+
+def _without_masked(rows, mask):
+    """The same with 0 in masked rows: a NaN there would win every comparison, and 0 * NaN spoil the gradients."""
+    return jnp.where(mask[:, None], rows, jnp.zeros((), rows.dtype))
 
 
 def chamfer(points, targets, point_mask=None, target_mask=None, *, chunk: int = 64):

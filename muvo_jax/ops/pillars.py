@@ -41,6 +41,8 @@ def decorate(points_m: jax.Array, index: jax.Array, cell: jax.Array, grid: Pilla
              swapped_corners: bool = False) -> jax.Array:
     """What the network sees of a point: x, y, z; the same minus the pillar's mean; x, y minus the cell's centre.
 
+    Padding and points outside the grid count as (0, 0, 0): whatever they hold, even NaN, reaches no gradient.
+
     Args:
       points_m, index, cell: of `pillar_indices`.
       swapped_corners: measure from the cell's lower corner, and with the two axes of the cell mixed up, as the
@@ -49,10 +51,11 @@ def decorate(points_m: jax.Array, index: jax.Array, cell: jax.Array, grid: Pilla
     Returns:
       float32 [F, N, 8].
     """
-    segments = points_m.shape[0] * grid.cells**2 + 1
+    nowhere = points_m.shape[0] * grid.cells**2
+    points_m = jnp.where(jnp.expand_dims(index < nowhere, -1), points_m, jnp.zeros((), points_m.dtype))
     flat, flat_index = points_m.reshape(-1, 3), index.reshape(-1)
     counted = jnp.concatenate([flat, jnp.ones_like(flat[:, :1])], axis=1)
-    total = jax.ops.segment_sum(counted, flat_index, segments)[flat_index]
+    total = jax.ops.segment_sum(counted, flat_index, nowhere + 1)[flat_index]
     mean = (total[:, :3] / jnp.maximum(total[:, 3:], 1.0)).reshape(points_m.shape)
     if swapped_corners:
         place = cell[..., ::-1].astype(jnp.float32)

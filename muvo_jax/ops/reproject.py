@@ -32,12 +32,19 @@ def move_range_view(range_view: Array, pose: Array, geometry: RangeViewGeometry)
     Returns:
       float32 [N, Hr, Wr, 4], (0, 0, 0, -1) where nothing came to lie. Points that leave the field of view are gone.
     """
-    points_m = range_view.reshape(range_view.shape[0], -1, 4)
-    return splat(motion.into_frame(points_m[..., :3], pose), points_m[..., 3] > 0.0, geometry)
+    rows = range_view.reshape(range_view.shape[0], -1, 4)
+    valid = rows[..., 3] > 0.0
+    # Before they are moved: the slope of a pixel without a return that holds NaN would spoil that of the pose.
+    points_m = _where_valid(rows[..., :3], valid)
+    return splat(motion.into_frame(points_m, pose), valid, geometry)
 
 
 def splat(points_m: Array, valid: Array, geometry: RangeViewGeometry) -> Array:
-    """Points [N, P, 3] (ego frame) as range views [N, Hr, Wr, 4], the nearest valid one [N, P] of each pixel."""
+    """Points [N, P, 3] (ego frame) as range views [N, Hr, Wr, 4], the nearest valid one [N, P] of each pixel.
+
+    What is not valid may hold anything; but 0 times NaN is NaN, so do not move NaN by a pose whose gradient is wanted.
+    """
+    points_m = _where_valid(points_m, valid)
     count, points = valid.shape
     cells = geometry.rows * geometry.columns
     row, column, range_m = _polar(points_m, geometry)
@@ -54,6 +61,11 @@ def splat(points_m: Array, valid: Array, geometry: RangeViewGeometry) -> Array:
     chosen = _rows(seen, jnp.maximum(winner, 0))
     chosen = jnp.where(jnp.expand_dims(winner >= 0, -1), chosen, _hole(chosen))
     return chosen.reshape(count, geometry.rows, geometry.columns, 4)
+
+
+def _where_valid(points_m: Array, valid: Array) -> Array:
+    """Points [N, P, 3], (0, 0, 0) where they are not valid [N, P]."""
+    return jnp.where(jnp.expand_dims(valid, -1), points_m, jnp.zeros((), points_m.dtype))
 
 
 def move_image(image: Array, range_m: Array, pose: Array, intrinsics: Array, camera_to_ego: Array,

@@ -51,14 +51,19 @@ class TownDrive(NamedTuple):
     restless: bool = False
 
 
+def check_size(size: str) -> None:
+    """Raises ValueError for a size that does not exist, naming those that do."""
+    if size not in settings.SIZES:
+        raise ValueError(f"town size {size!r} is unknown; known are {', '.join(settings.SIZES)}.")
+
+
 def jobs(size: str) -> list[TownDrive]:
     """All runs of a size, in the order of splits.
 
     Raises:
       ValueError: for a size that does not exist.
     """
-    if size not in settings.SIZES:
-        raise ValueError(f"town size {size!r} is unknown; known are {', '.join(settings.SIZES)}.")
+    check_size(size)
     return [TownDrive(split, f"{index:03d}_{plan.weathers[index % len(plan.weathers)]}", plan.first_seed + index,
                 plan.weathers[index % len(plan.weathers)], plan.frames, 1 + index % 2 if restless else 0, restless)
             for split, plan in settings.SIZES[size].items() for index in range(plan.runs)
@@ -79,6 +84,7 @@ def cached_town(config: config_lib.Config, progress: Progress | None = None, *,
     Raises:
       ValueError: for a size or split that does not exist.
     """
+    check_size(config.data.town_size)
     town_config = settings.from_config(config)
     cache = pathlib.Path(os.environ.get("XDG_CACHE_HOME") or pathlib.Path.home() / ".cache")
     directory = cache / "muvo_jax" / f"town-{fingerprint(town_config, config.data.town_size)}"
@@ -113,7 +119,7 @@ def record_town(directory: pathlib.Path | str, town_config: settings.TownConfig,
     Raises:
       ValueError: for a size that does not exist.
       FileExistsError: where the directory holds a recording of other settings.
-      RuntimeError: where a worker failed; its message is included.
+      WorkerError: where a worker failed; its message is included.
     """
     directory = pathlib.Path(directory)
     planned = [job for job in jobs(size) if split in (None, job.split)]
@@ -216,8 +222,8 @@ def _record_in_workers(directory: pathlib.Path, town_config: settings.TownConfig
                 process.wait()
         if any(failed):
             errors.seek(0)
-            raise RuntimeError(f"recording the town into {directory} failed (exit codes {failed}):\n"
-                               f"{errors.read()[-2000:]}")
+            raise processes.WorkerError(f"recording the town into {directory} failed (exit codes {failed}):\n"
+                                        f"{errors.read()[-2000:]}")
 
 
 def _work() -> None:

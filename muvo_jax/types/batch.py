@@ -74,6 +74,13 @@ class Batch(Indexable):
     intrinsics: ArrayLike | None = None
     camera_to_ego: ArrayLike | None = None
 
+    def __getitem__(self, index) -> Batch:
+        """`batch[2:4]`, `batch[:, 3:]`: calibration, one for each window, is indexed by the window alone."""
+        of_window = index[:1] if isinstance(index, tuple) else index
+        chosen = {name: value[of_window if name in UNTIMED_FIELDS else index]
+                  for name, value in vars(self).items() if value is not None}
+        return dataclasses.replace(self, **chosen)
+
     @property
     def batch_size(self) -> int:
         return self.action.shape[0]

@@ -121,6 +121,9 @@ class StepNoise(Indexable):
 class Observed(Indexable):
     """What `observe` returns, time on axis 1.
 
+    An index applies to states and Gaussians; the memory, which has no time, follows it along the batch alone, so that
+    the states of some frames are decoded with all that was remembered.
+
     Attributes:
       states: LatentState [B, T, ...], each with its posterior's sample, which is what decoders read (under the RSSM
         dropout of training, the recurrence itself may have gone on from the prior's).
@@ -132,6 +135,11 @@ class Observed(Indexable):
     posterior: Gaussian
     prior: Gaussian
     memory: Memory | None = None
+
+    def __getitem__(self, index) -> Observed:
+        of_batch = index[:1] if isinstance(index, tuple) else index
+        return Observed(self.states[index], self.posterior[index], self.prior[index],
+                        None if self.memory is None else self.memory[of_batch])
 
     @property
     def last(self) -> LatentState:

@@ -7,9 +7,9 @@ import pytest
 
 from muvo_jax import config as config_lib
 from muvo_jax import presets
-from muvo_jax.model import encoders, world_model
+from muvo_jax.model import checks, encoders, world_model
 from muvo_jax.nn import norm
-from muvo_jax.types import BATCH_FIELDS
+from muvo_jax.types import BATCH_FIELDS, Batch
 
 # Rows, columns of the maps: images of 32x64, range views of 32x64, 32 pillars and 8 cells of bird's-eye view on a side.
 MAPS = {
@@ -69,3 +69,20 @@ def test_the_small_route_encoder_tells_left_from_right():
     params = jax.tree.map(lambda leaf: random.normal(size=leaf.shape).astype(np.float32), shapes)
     left, right = encoder.apply({"params": params}, jnp.asarray(route), norm.Mode())
     assert left.shape == (config.measurement_channels,) and np.abs(left - right).max() > 0.1
+
+
+def test_a_command_out_of_range_is_the_nearest_one_under_jit_and_refused_where_it_is_at_hand():
+    config = config_of("wob", "rv", "tr", "1d")
+    encoder, commands = encoders.CommandEncoder(config), jnp.array([-1, 0, 5, 6])
+    shapes = jax.eval_shape(lambda: encoder.init(jax.random.key(0), commands))["params"]
+    params = jax.tree.map(lambda leaf: np.random.default_rng(0).normal(size=leaf.shape).astype(np.float32), shapes)
+    got = jax.jit(encoder.apply)({"params": params}, commands)
+    np.testing.assert_array_equal(got[::3], got[1:3])
+    assert np.abs(got[0] - got[3]).max() > 0.1
+    model = world_model.WorldModel(config)
+    batch = Batch(action=np.zeros((1, 2, 2), np.float32), is_first=np.ones((1, 2), bool),
+                  command=np.int32([[0, 5]]), next_command=np.int32([[0, 5]]))
+    checks.observation("observe", model, batch)
+    with pytest.raises(ValueError, match=r"observe: next_command \[1, 2\] holds 6; expected 0 to 5 \(left"):
+        checks.observation("observe", model, batch.replace(next_command=jnp.array([[0, 6]])))
+    jax.jit(lambda command: checks.observation("observe", model, batch.replace(command=command)))(np.int32([[6, -1]]))

@@ -38,13 +38,24 @@ def test_evaluation_uses_the_running_moments_and_keeps_them():
 
 def test_variance_of_values_far_from_zero_does_not_cancel():
     x = jnp.float32([4096.0, 4097.0, 4098.0])[:, None]
-    _, var, unbiased = norm.batch_moments(x, None)
+    _, var, unbiased, _ = norm.batch_moments(x, None)
     np.testing.assert_allclose([var[0], unbiased[0]], [2 / 3, 1.0], rtol=1e-6)
 
 
 def test_one_value_has_zero_variance_and_a_finite_gradient():
     gradient = jax.grad(lambda x: apply(VARIABLES, x, norm.Mode(train=True))[0].sum())(jnp.ones((1, 1)))
     assert np.isfinite(gradient).all()
+
+
+@pytest.mark.parametrize(("kept", "mean", "var"), [(0, 1.0, 3.0), (1, 0.9 + 0.1 * 7, 3.0), (2, 1.6, 0.9 * 3)])
+def test_too_few_rows_leave_the_running_moments_as_they_were(kept, mean, var):
+    mask = jnp.arange(4) < kept
+    masked = lambda x, mask, axis_name: norm.BatchNorm().apply(
+        VARIABLES, x, norm.Mode(True, axis_name), mask, mutable=["batch_stats"])[1]["batch_stats"]
+    over_devices = jax.vmap(functools.partial(masked, axis_name="data"), axis_name="data")(
+        jnp.full((4, 1, 1), 7.0), mask[:, None])  # no device has two rows, all together may
+    for stats in (masked(jnp.full((4, 1), 7.0), mask, None), jax.tree.map(lambda leaf: leaf[3], over_devices)):
+        np.testing.assert_allclose([stats["mean"][0], stats["var"][0]], [mean, var], rtol=1e-6)
 
 
 def test_over_an_axis_the_statistics_and_gradients_are_those_of_the_whole_batch():

@@ -41,6 +41,18 @@ def test_cross_entropy_counts_weights_and_the_worst_pixels():
         mean(weights=(1.0, 1.0, 1.0))
 
 
+def test_labels_that_are_no_class_do_not_count():
+    logits = jax.random.normal(jax.random.key(0), (1, 1, 5, 4))
+    score = jax.jit(jax.value_and_grad(
+        lambda logits, target: classification.cross_entropy_sums(logits, target, weights=(1.0, 2.0, 3.0, 4.0)).value()))
+    for target in (np.uint8([0, 4, 2, 254, 3]), np.int32([0, 4, 2, -1, 3])):
+        unlabelled = np.where(target < 4, target, 255).astype(np.uint8)
+        unlabelled[3] = 255
+        expected = score(logits, unlabelled[None, None])
+        assert all(np.isfinite(value).all() for value in jax.tree.leaves(expected))
+        jax.tree.map(np.testing.assert_array_equal, score(logits, target[None, None]), expected)
+
+
 def test_instances_have_a_centre_and_each_cell_knows_the_way():
     numbers = np.zeros((1, 6, 8), np.int32)
     numbers[0, 1:4, 2:5], numbers[0, 5, 7] = 1, 2

@@ -46,6 +46,21 @@ def test_without_valid_targets_distances_are_infinite_and_gradients_zero(strict_
     assert np.isnan(nearest.chamfer(points, targets, everybody, nobody))
 
 
+@pytest.mark.parametrize("garbage", [np.nan, np.inf, 3e38])
+def test_what_is_masked_changes_neither_distances_nor_gradients(garbage, strict_dtypes):
+    points = jnp.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [garbage] * 3])
+    targets = jnp.array([[0.0, 0.0, 1.0], [garbage] * 3, [5.0, 0.0, 0.0]])
+    point_mask, target_mask = jnp.array([True, True, False]), jnp.array([True, False, True])
+    distances = lambda targets: nearest.nearest_distance(points[:2], targets, target_mask)
+    np.testing.assert_allclose(jax.jit(distances)(targets), [1.0, 2.0**0.5], rtol=1e-6)
+    np.testing.assert_array_equal(nearest.nearest_index(points[:2], targets, target_mask), [0, 0])
+    clean = jnp.where(point_mask[:, None], points, 0.0), jnp.where(target_mask[:, None], targets, 0.0)
+    for loss in (lambda points, targets: distances(targets).sum(),
+                 lambda points, targets: sum(nearest.chamfer_sums(points, targets, point_mask, target_mask)[::2])):
+        gradients = jax.jit(jax.value_and_grad(loss, (0, 1)))
+        jax.tree.map(np.testing.assert_array_equal, gradients(points, targets), gradients(*clean))
+
+
 def test_chamfer_is_half_of_both_means(strict_dtypes):
     points = jnp.array([[0.0, 0.0, 0.0], [4.0, 0.0, 0.0]])
     targets = jnp.array([[0.0, 3.0, 0.0], [99.0, 99.0, 99.0]])

@@ -292,3 +292,14 @@ def test_gradients_of_everything_with_respect_to_the_pose_are_finite():
         for name, by_pose in slopes(where).items():
             assert np.isfinite(by_pose).all(), (name, at)
             assert np.abs(by_pose).max() > 0 or at[0] != 0.7, (name, at)
+
+
+def test_what_a_pixel_without_return_holds_reaches_no_slope():
+    scan = random_scan()
+    holes = np.where(scan[..., 3:] > 0, scan, [[[np.nan, np.nan, np.nan, -1.0]]]).astype(np.float32)
+    rows = lambda view: jnp.asarray(view.reshape(1, -1, 4))
+    by_pose = jax.jit(jax.grad(lambda at, view: jnp.tanh(reproject.move_range_view(view, at, GEOMETRY)).sum()))
+    by_points = jax.jit(jax.grad(lambda view: reproject.splat(view[..., :3], view[..., 3] > 0, GEOMETRY).sum()))
+    moved = pose(0.5, 0.1, 0.2)
+    np.testing.assert_array_equal(by_pose(moved, holes[None]), by_pose(moved, scan[None]))
+    np.testing.assert_array_equal(by_points(rows(holes)), by_points(rows(scan)))

@@ -24,6 +24,8 @@ import tyro
 from muvo_jax import late
 
 with late.imports():
+    import jax
+
     from muvo_jax import recordings
     from muvo_jax.training import checkpoint, host, screen
 
@@ -33,7 +35,8 @@ if TYPE_CHECKING:
     from muvo_jax.data import schema
 
 TRACEBACK_VARIABLE = "MUVO_JAX_TRACEBACK"
-EXPECTED_ERRORS = (ValueError, OSError, ArithmeticError)  # DataError, CheckpointError and NonFiniteLossError are these
+# DataError, CheckpointError, WorkerError and NonFiniteLossError are these.
+EXPECTED_ERRORS = (ValueError, OSError, ArithmeticError, MemoryError)
 _Options = TypeVar("_Options")
 _Result = TypeVar("_Result")
 
@@ -79,11 +82,14 @@ def run(options_type: type[_Options], work: Callable[[_Options, screen.Screen], 
         warnings.showwarning = lambda message, *_, **__: show.warn(str(message))  # type: ignore[assignment]
         try:
             return status(work(options, show))
-        except EXPECTED_ERRORS as error:
+        except (*EXPECTED_ERRORS, jax.errors.JaxRuntimeError) as error:
+            said = explained(error)
+            if said is None:
+                raise
             show.stop()
             if os.environ.get(TRACEBACK_VARIABLE):
                 traceback.print_exc()
-            print(f"error: {error}", file=sys.stderr)
+            print(f"error: {said}", file=sys.stderr)
             if not os.environ.get(TRACEBACK_VARIABLE):
                 print(f"({type(error).__name__}; {TRACEBACK_VARIABLE}=1 shows where)", file=sys.stderr)
             return failed
@@ -91,6 +97,18 @@ def run(options_type: type[_Options], work: Callable[[_Options, screen.Screen], 
             show.stop()
             print("interrupted.", file=sys.stderr)
             return 130
+
+
+def explained(error: Exception) -> str | None:
+    """What is said of an expected error, of JAX's those of memory that ran out; None for one that is a defect."""
+    if isinstance(error, EXPECTED_ERRORS):
+        return str(error)
+    if "RESOURCE_EXHAUSTED" not in str(error):
+        return None
+    reason = next(line for line in str(error).splitlines() if "RESOURCE_EXHAUSTED" in line)
+    return (f"the device's memory ran out ({reason[:200]}): take a smaller --batch, and for training --set "
+            f"train.remat=frames; python -m muvo_jax.estimate with the same flags says what a training needs, and with "
+            f"--memory-gib=N what fits.")
 
 
 @contextlib.contextmanager

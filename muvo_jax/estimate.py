@@ -27,8 +27,9 @@ _REMATS = ("none", "heads", "frames")  # from fast to small
 class Options(train.Options):
     """Says what a training would need: memory, arithmetic and time of a step, by compiling it for shapes alone.
 
-    Takes the flags of muvo_jax.train, so that its command line can be copied. No data is opened: sizes are those of the
-    preset and its flags. What is compiled here need not be compiled again by a training with the same flags.
+    Takes the flags of muvo_jax.train, so that its command line can be copied, but for those of several hosts. No data
+    is opened: sizes are those of the preset and its flags. What is compiled here need not be compiled again by a
+    training with the same flags.
     """
 
     memory_gib: Annotated[float | None, command_line.shown("GIB", "only say what is needed")] = None
@@ -46,7 +47,20 @@ python -m muvo_jax.estimate --preset=paper-occupancy --accumulate=1 --set train.
 
 
 def estimate(options: Options, show: screen.Screen) -> None:
-    """Compiles the step and says what it needs; with --memory-gib, looks for settings that fit."""
+    """Compiles the step and says what it needs; with --memory-gib, looks for settings that fit.
+
+    Raises:
+      ValueError: for flags that it cannot follow, before anything is compiled; where nothing fits.
+    """
+    if not 0 < options.share <= 1:
+        raise ValueError(f"--share is {options.share:g}; expected a share of the speed of a matrix product, above 0 "
+                         f"and at most 1.")
+    hosts = [f"--{flag}={value}" for flag in ("hosts", "host", "coordinator")
+             if (value := getattr(options, flag)) is not None]
+    if hosts:
+        raise ValueError(f"{' '.join(hosts)}: what one process needs is estimated, without the others. Leave these "
+                         f"flags out and give this process's share of the windows with --batch: that of all, divided "
+                         f"by the number of processes.")
     config, chosen, _ = train.configure(options)
     preparation.check_trainable(config)
     rate = cost.product_rate(config.model.compute_dtype)
@@ -113,7 +127,12 @@ def suggest(config: config_lib.Config, available_bytes: float, *, fixed: bool) -
             continue
         most = sizes[0] if len(sizes) == 1 else cost.largest_batch(
             (sizes[0], least), (sizes[1], of_config(sized(sizes[1]))), available_bytes)
-        return sized(max(size for size in sizes if size <= max(most, sizes[0])))
+        found = [size for size in sizes if size <= max(most, sizes[0])]
+        # Of windows that the devices cannot share evenly, what one more costs is not the same for each.
+        while found[-1] > sizes[0] and found[-1] % jax.device_count() and (
+                of_config(sized(found[-1])).total_bytes > available_bytes):
+            found.pop()
+        return sized(found[-1])
     return None
 
 

@@ -22,6 +22,16 @@ class _OneSplit:
             self.read_fields = recording.read_fields
 
 
+def check_town(data: config_lib.DataConfig) -> None:
+    """Raises DataError where the town is asked for what only other recordings have."""
+    if data.camera:
+        raise schema.DataError(f"the built-in town has no camera {data.camera!r}; it has one only. Leave --data-camera "
+                               f"out, or give the recording with --data=PATH.")
+    if data.key_frames:
+        raise schema.DataError("the built-in town has no key frames; leave --key-frames out, or give the recording "
+                               "with --data=PATH.")
+
+
 def open_configured(config: config_lib.Config, progress: record.Progress | None = None, *,
                     split: str | None = None) -> schema.Recording:
     """Opens the recording that a config names; the built-in town is recorded first where it is not in the cache.

@@ -32,6 +32,15 @@ def load(path: str | os.PathLike) -> dict[str, np.ndarray]:
     Raises:
       SafetensorsError: where the file is missing, damaged or no safetensors file.
     """
+    return load_with_metadata(path)[0]
+
+
+def load_with_metadata(path: str | os.PathLike) -> tuple[dict[str, np.ndarray], dict[str, str]]:
+    """As `load`, and the text that the file says of itself, {name: text}.
+
+    Raises:
+      SafetensorsError: as `load`.
+    """
     path = pathlib.Path(path).expanduser()
     try:
         mapped = np.memmap(path, np.uint8, mode="r")
@@ -48,7 +57,10 @@ def load(path: str | os.PathLike) -> dict[str, np.ndarray]:
             position = entry["data_offsets"][1]
         if position != data.size:
             raise ValueError(f"its tensors have {position} bytes, the file has {data.size}")
-        return tensors
+        metadata = header.get("__metadata__", {})
+        if not isinstance(metadata, dict) or not all(isinstance(text, str) for text in metadata.values()):
+            raise ValueError("its __metadata__ is no table of text")
+        return tensors, metadata
     except Exception as error:  # a damaged header is any JSON, and its parser has limits of its own
         reason = error.strerror if isinstance(error, OSError) else str(error)
         raise SafetensorsError(f"{path}: expected a safetensors file; it cannot be read ({type(error).__name__}: "

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import dataclasses
-import itertools
 import pathlib
 import shlex
 import sys
 import traceback
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Annotated, Any
 
 import numpy as np
@@ -17,12 +16,22 @@ import tyro
 from muvo_jax import command_line, late
 
 with late.imports():
+    from muvo_jax import choices, dream, evaluate, presets, recordings
     from muvo_jax import config as config_lib
-    from muvo_jax import dream, evaluate, presets
     from muvo_jax.interop import backbones
     from muvo_jax.metrics import protocol
     from muvo_jax.objectives import perceptual
-    from muvo_jax.training import checkpoint, loop, run_folder, screen, start, together, validation
+    from muvo_jax.training import (
+        builtin,
+        checkpoint,
+        loop,
+        run_folder,
+        screen,
+        start,
+        together,
+        transfer,
+        validation,
+    )
     from muvo_jax.viz import curves, sheets
 
 PERCEPTUAL_WEIGHT = 0.1  # the reference's
@@ -78,7 +87,7 @@ class Options:
     augment: tyro.conf.FlagCreatePairsOff[bool] = False
     """Vary images and route maps that the encoders see in training, whatever the preset says."""
     no_augment: tyro.conf.FlagCreatePairsOff[bool] = False
-    """Show them as they were recorded."""
+    """Train on windows as they were recorded, not mirrored or in another light either."""
     data: Annotated[str | None, command_line.shown("PATH")] = None
     """"town" (built in) or the folder of a recording; its kind is recognised."""
     data_camera: Annotated[str | None, command_line.shown("NAME", "the reader's choice")] = None
@@ -147,26 +156,28 @@ def configure(options: Options) -> tuple[config_lib.Config, dict[str, Any], path
     """Returns the config, the settings that the user chose by dotted name, and the run's folder.
 
     Raises:
-      ValueError: for an unknown setting or a value of the wrong type; for another preset than that of the resumed run.
+      ValueError: for an unknown setting or a value of the wrong type; for flags and settings that contradict each
+        other; for another preset than that of the resumed run, or another network than that of the run to start from.
       FileNotFoundError, CheckpointError: where there is no run to resume or to start from.
     """
     if options.resume and options.init:
         raise ValueError("--resume and --init contradict each other: a resumed run has weights of its own.")
-    options = dataclasses.replace(options, **{flag: getattr(options, flag).lower() for flag in _ANY_CASE
-                                              if getattr(options, flag) is not None})
+    options = _in_lower_case(options)
     settings = command_line.parse_settings(options.set)
-    chosen = (_variant_settings(options, settings) | _network_settings(options)
+    choices.check(options, settings, _FIELDS)
+    chosen = (choices.of_variant(options, settings) | _network_settings(options, settings)
               | command_line.chosen_settings(options, _FIELDS) | settings)
     base = presets.get(options.preset or "town")
-    folder = options.runs_dir / (options.name or default_name(options))
+    started = checkpoint.load_run(options.init) if options.init else None
+    folder = options.runs_dir / run_name(options)
     if options.resume:
         base = run_folder.read_config(folder)
         if options.preset not in (None, base.preset):
             raise ValueError(f"run {folder} was started with preset {base.preset!r}, not {options.preset!r}: leave "
                              f"--preset away, or start another run with --name.")
-    elif options.init:
-        base = dataclasses.replace(base, model=checkpoint.load_run(options.init).config.model)
-    heads = _heads(options, chosen.get("model.heads", base.model.heads))
+    elif started is not None:
+        base = dataclasses.replace(base, model=started.config.model)
+    heads = choices.heads(options, chosen.get("model.heads", base.model.heads))
     if heads is not None:
         chosen["model.heads"] = heads
     if options.key_frames:
@@ -174,7 +185,7 @@ def configure(options: Options) -> tuple[config_lib.Config, dict[str, Any], path
     if options.augment or options.no_augment:
         if options.augment and options.no_augment:
             raise ValueError("--augment and --no-augment contradict each other: give one of them.")
-        for name in ("image", "route"):
+        for name in ("image", "route") if options.augment else ("image", "route", "mirror", "light"):
             chosen.setdefault(f"augmentation.{name}", options.augment)
     if chosen.get("model.fusion", "tr") != "tr" and isinstance(base.model.latent, config_lib.TokenLatent):
         chosen.setdefault("model.latent", "1d")  # the only one that such a fusion has
@@ -184,42 +195,26 @@ def configure(options: Options) -> tuple[config_lib.Config, dict[str, Any], path
                          f"): add --with-heads=image, or leave --perceptual away.")
     if base.data.path != "town":
         base = config_lib.override(base, "data.path", str(pathlib.Path(base.data.path).expanduser().resolve()))
+    elif {"data.camera", "data.key_frames"} & chosen.keys():
+        recordings.check_town(base.data)
+    if started is not None and any(name.startswith("model.") for name in chosen):
+        transfer.check(started, base)
     return base, chosen, folder
 
 
-def _variant_settings(options: Options, settings: Mapping[str, Any]) -> dict[str, str]:
-    """{"model.lidar": "pp", ...} from --variant=PP-BEV-FC.
-
-    Raises:
-      ValueError: for a name that does not exist, or another flag or one of --set's `settings` that contradicts it.
-    """
-    if options.variant is None:
-        return {}
-    kinds = (config_lib.LIDARS, config_lib.CAMERAS, config_lib.FUSIONS)
-    known = ["-".join(parts).upper() for parts in itertools.product(*kinds)]
-    if options.variant.upper() not in known:
-        raise ValueError(f"--variant={options.variant} is unknown; known are {', '.join(known)}.")
-    parts = dict(zip(("lidar", "camera", "fusion"), options.variant.lower().split("-"), strict=True))
-    for flag, value in parts.items():
-        for name, other in ((f"--{flag}", getattr(options, flag)),
-                            (f"--set model.{flag}", settings.get(f"model.{flag}"))):
-            if other not in (None, value):
-                raise ValueError(f"--variant={options.variant} and {name}={other} contradict each other: give one of "
-                                 f"them.")
-    return {f"model.{flag}": value for flag, value in parts.items()}
-
-
-def _network_settings(options: Options) -> dict[str, Any]:
-    """What --backbone-weights, --perceptual and --perceptual-from set.
+def _network_settings(options: Options, chosen: Mapping[str, Any]) -> dict[str, Any]:
+    """What --backbone-weights, --perceptual and --perceptual-from set, beside what --set does.
 
     Raises:
       ValueError: where they contradict other flags, or the perceptual term has no network.
     """
     settings: dict[str, Any] = {}
+    given = options.backbone_weights or "train.backbone_weights" in chosen
+    if given and (options.init or options.resume):
+        flag = "--backbone-weights" if options.backbone_weights else "--set train.backbone_weights"
+        raise ValueError(f"{flag} and --{'init' if options.init else 'resume'} contradict each other: the encoders "
+                         f"have weights then. Give one of them.")
     if options.backbone_weights:
-        if options.init or options.resume:
-            raise ValueError(f"--backbone-weights and --{'init' if options.init else 'resume'} contradict each other: "
-                             f"the encoders have weights then. Give one of them.")
         settings["train.backbone_weights"] = str(options.backbone_weights.expanduser().resolve())
     if options.perceptual or options.perceptual_from:
         source = options.perceptual_from or options.backbone_weights
@@ -227,8 +222,9 @@ def _network_settings(options: Options) -> dict[str, Any]:
             raise ValueError("--perceptual compares pictures by the maps of a trained image network, and there is "
                              "none: give --backbone-weights=PATH (a ResNet-18 of ImageNet, say) or "
                              "--perceptual-from=RUN (one of your runs).")
+        shipped = builtin.named(source) is not None  # a name, and no file here
         settings |= {"loss.image_perceptual": PERCEPTUAL_WEIGHT,
-                     "train.perceptual_from": str(source.expanduser().resolve())}
+                     "train.perceptual_from": str(source if shipped else source.expanduser().resolve())}
     return settings
 
 
@@ -244,36 +240,26 @@ def frozen_encoder(config: config_lib.Config) -> perceptual.FrozenEncoder | None
         raise ValueError("loss.image_perceptual is on, but train.perceptual_from names no network. Give --perceptual "
                          "with --backbone-weights=PATH or --perceptual-from=RUN.")
     path = pathlib.Path(config.train.perceptual_from).expanduser()
-    if not path.is_dir():
+    if builtin.named(path) is None and not path.is_dir():
         return backbones.frozen_encoder(backbones.read(path))
     loaded = checkpoint.load_run(path)
     return backbones.frozen_encoder_of_run(loaded.variables, loaded.config.model, f"step {loaded.step} of {path}")
 
 
-def _heads(options: Options, heads: Sequence[str]) -> tuple[str, ...] | None:
-    """The heads that the flags make of those of the preset, None where no flag speaks of heads.
+def run_name(options: Options) -> str:
+    """That of the run's folder in RUNS_DIR; it may lie in folders there, as a/b does."""
+    return options.name or default_name(_in_lower_case(options))
 
-    Raises:
-      ValueError: for a head that does not exist, or flags that contradict each other.
-    """
-    if (options.heads, options.with_heads, options.occupancy, options.no_occupancy) == (None, None, False, False):
-        return None
-    exact, more = ([name.strip() for name in text.split(",")] if text else []
-                   for text in (options.heads, options.with_heads))
-    for flag, names in (("--heads", exact), ("--with-heads", more)):
-        for name in names:
-            config_lib.check_choice(flag, name, tuple(config_lib.KNOWN_HEADS))
-    if options.no_occupancy and (options.occupancy or "occupancy" in exact + more):
-        raise ValueError("--no-occupancy and --occupancy (or --heads and --with-heads with occupancy) contradict each "
-                         "other: give one of them.")
-    wanted = {*(exact or heads), *more} | ({"occupancy"} if options.occupancy else set())
-    wanted -= {"occupancy"} if options.no_occupancy else set()
-    return tuple(head for head in config_lib.KNOWN_HEADS if head in wanted)
+
+def _in_lower_case(options: Options) -> Options:
+    """What the paper writes in capitals."""
+    return dataclasses.replace(options, **{flag: getattr(options, flag).lower() for flag in _ANY_CASE
+                                           if getattr(options, flag) is not None})
 
 
 def default_name(options: Options) -> str:
     """Such as town-tr, tiny-pp-bev-fc or kitti_raw-tr-2d."""
-    settings = _variant_settings(options, {})
+    settings = choices.of_variant(options, {})
     lidar, camera, fusion = (getattr(options, flag) or settings.get(f"model.{flag}", usual)
                              for flag, usual in (("lidar", "rv"), ("camera", "wob"), ("fusion", "tr")))
     parts = [options.preset or "town", fusion if (lidar, camera) == ("rv", "wob") else f"{lidar}-{camera}-{fusion}"]
@@ -290,7 +276,8 @@ def train(options: Options, show: screen.Screen) -> None:
         together.join(launch, show)
     config, chosen, folder = configure(options)
     elsewhere = [f"--runs-dir={options.runs_dir}"] if options.runs_dir != pathlib.Path("runs") else []
-    resume_command = shlex.join(["python", "-m", "muvo_jax.train", f"--name={folder.name}", "--resume", *elsewhere])
+    resume_command = shlex.join(["python", "-m", "muvo_jax.train", f"--name={run_name(options)}", "--resume",
+                                 *elsewhere])
     visible = bool(protocol.shown_heads(config.model))
     with together.noticing_losses(resume_command):
         outcome = loop.train(loop.Job(

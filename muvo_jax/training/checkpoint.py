@@ -27,7 +27,7 @@ from muvo_jax import config as config_lib
 from muvo_jax import run as run_lib
 from muvo_jax import types
 from muvo_jax.model import world_model
-from muvo_jax.training import builtin, checkpoint_meta, integrity, together
+from muvo_jax.training import builtin, checkpoint_meta, integrity, screen, together
 
 FOLDER = "checkpoints"
 _preservation = ocp.checkpoint_managers
@@ -85,8 +85,10 @@ class Checkpoints:
         self.saved: int | None = None
 
     def _open(self) -> ocp.CheckpointManager:
+        barrier = together.SavingBarrier() if jax.process_count() > 1 else None
         options = ocp.CheckpointManagerOptions(preservation_policy=self._policy, create=True,
                                                cleanup_tmp_directories=True,
+                                               async_options=ocp.AsyncOptions(barrier_sync_fn=barrier),
                                                best_fn=_score)  # or scores would not be there when a run goes on
         return ocp.CheckpointManager(self.folder, options=options, item_names=("variables", "training", "meta"))
 
@@ -155,13 +157,14 @@ class Checkpoints:
 
     def _failed(self, step: int, error: Exception) -> NoReturn:
         """Orbax and TensorStore raise OSError, ValueError or RuntimeError for a full disk."""
-        if together.is_loss(error) or not together.is_first():
+        if together.is_loss(error):
             raise error
-        shutil.rmtree(self.folder / str(step), ignore_errors=True)
-        self._discard_partial_saves()
+        if together.is_first():
+            shutil.rmtree(self.folder / str(step), ignore_errors=True)
+            self._discard_partial_saves()
         kept = [str(other) for other in self.steps() if integrity.damage(self.folder / str(other)) is None]
         raise CheckpointError(
-            f"checkpoint of step {step} could not be written to {self.folder}: {_first_line(error)}. Is the disk full, "
+            f"checkpoint of step {step} could not be written to {self.folder}: {screen.said(error)}. Is the disk full, "
             f"or the folder read-only? Readable checkpoints: {', '.join(kept) or 'none'}. Mend that and go on with "
             f"--resume.") from error
 
@@ -197,7 +200,7 @@ class Checkpoints:
                 try:
                     state = self._restore(step, abstract, like)
                 except Exception as error:  # whatever Orbax raises: the checkpoint before may still be good
-                    reason = f"it cannot be restored ({_first_line(error)})"
+                    reason = f"it cannot be restored ({screen.said(error)})"
                 else:
                     self.saved = step
                     return Restored(state, step, checkpoint_meta.read_data_state(meta), meta, tuple(warnings))
@@ -263,6 +266,8 @@ def load_run(run: str | os.PathLike, which: int | str = "latest") -> run_lib.Run
       CheckpointError: where there is no run, no such checkpoint, or none that can be read.
       ValueError: where it was written by a version with an unknown schema or configuration, or ships with none.
     """
+    if isinstance(which, str) and which.isdecimal():
+        which = int(which)
     if (name := builtin.named(run)) is not None:
         shipped = builtin.load(name)
         if which not in ("latest", "best", shipped.step):
@@ -274,8 +279,8 @@ def load_run(run: str | os.PathLike, which: int | str = "latest") -> run_lib.Run
     if not found:
         state = "has no checkpoint yet" if folder.is_dir() else "does not exist"
         raise CheckpointError(f"{folder} {state}; expected {checkpoints}/STEP. Train first: python -m muvo_jax.train.")
-    candidates = _candidates(checkpoints, found, which)
-    warnings: list[str] = []
+    candidates, note = _candidates(checkpoints, found, which)
+    warnings = [note] if note else []
     for step in candidates:
         path = checkpoints / str(step)
         reason = integrity.damage(path)
@@ -289,18 +294,21 @@ def load_run(run: str | os.PathLike, which: int | str = "latest") -> run_lib.Run
     raise CheckpointError(f"no readable checkpoint in {checkpoints}: " + " ".join(warnings))
 
 
-def _candidates(checkpoints: pathlib.Path, found: list[int], which: int | str) -> list[int]:
+def _candidates(checkpoints: pathlib.Path, found: list[int], which: int | str) -> tuple[list[int], str]:
+    """Steps in the order in which they are tried, and what to say of that; "" for nothing."""
     newest_first = found[::-1]
     if which == "latest":
-        return newest_first
+        return newest_first, ""
     if which == "best":
         scores = {step: checkpoint_meta.read(checkpoints / str(step))["score"] for step in newest_first
                   if integrity.damage(checkpoints / str(step)) is None}
         scored = {step: score for step, score in scores.items() if score is not None}
-        return [max(scored, key=scored.get)] if scored else newest_first  # type: ignore[arg-type]
+        if not scored:
+            return newest_first, f"no checkpoint in {checkpoints} has a score; the newest is taken for the best."
+        return [max(scored, key=scored.get)], ""  # type: ignore[arg-type]
     if which not in found:
         raise CheckpointError(f"{checkpoints} has no step {which}; it has {', '.join(map(str, found))}.")
-    return [int(which)]
+    return [int(which)], ""
 
 
 def _score(metrics: Mapping[str, float]) -> float:
@@ -308,8 +316,8 @@ def _score(metrics: Mapping[str, float]) -> float:
 
 
 def _quiet() -> None:
-    """Orbax reports every step of its work, and warns of metadata that a single item does not have."""
-    logging.getLogger("absl").setLevel(logging.ERROR)
+    """Orbax reports every step of its work, warns of metadata that a single item lacks, and logs what it raises."""
+    logging.getLogger("absl").setLevel(logging.CRITICAL)
 
 
 def _restore_variables(folder: pathlib.Path) -> types.Variables:
@@ -332,8 +340,3 @@ def _abstract(leaf):
 def _steps(folder: pathlib.Path) -> list[int]:
     return sorted(int(path.name) for path in folder.iterdir() if path.is_dir() and path.name.isdigit()) \
         if folder.is_dir() else []
-
-
-def _first_line(error: BaseException) -> str:
-    lines = str(error).strip().splitlines() or [""]
-    return f"{type(error).__name__}: {lines[0][:300]}"

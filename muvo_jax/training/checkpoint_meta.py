@@ -80,15 +80,14 @@ def check_resumable(wanted: config_lib.Config, stored: config_lib.Config, where:
     """As `check_architecture`, and ValueError where the optimiser's state is another: of other parameters, or kept in
     another way."""
     check_architecture(wanted, stored, where)
-    ours, theirs = wanted.train.trainable, stored.train.trainable
-    if ours != theirs:
-        raise ValueError(f"{where} was trained with train.trainable={theirs}, and cannot go on with {ours}: the "
-                         f"optimiser's state belongs to what trains. Start another run from its weights, with --init "
-                         f"and a new --name.")
-    if wanted.train.share_state != stored.train.share_state:
-        raise ValueError(f"{where} was trained with train.share_state={stored.train.share_state}, and cannot go on "
-                         f"with {wanted.train.share_state}: the optimiser's state is kept in another way. Start "
-                         f"another run from its weights, with --init and a new --name.")
+    for name, of, as_kept in (("train.trainable", lambda config: config.train.trainable, str),
+                              ("train.share_state", lambda config: config.train.share_state, bool),
+                              ("optimizer.clip_norm", lambda config: config.optimizer.clip_norm, bool)):
+        ours, theirs = of(wanted), of(stored)
+        if as_kept(ours) != as_kept(theirs):
+            raise ValueError(f"{where} was trained with {name}={theirs}, and cannot go on with {ours}: the optimiser's "
+                             f"state belongs to what trains and how. Start another run from its weights, with --init "
+                             f"and a new --name.")
 
 
 def package_versions() -> dict[str, str | None]:

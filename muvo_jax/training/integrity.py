@@ -15,16 +15,20 @@ DAMAGED_FOLDER = "damaged_checkpoints"
 def damage(folder: pathlib.Path) -> str | None:
     """Why a checkpoint folder cannot be trusted, or None where every file is as it was written."""
     try:
-        listed = json.loads((folder / CHECKSUM_FILE).read_text(encoding="utf-8"))["files"]
+        listed = list(json.loads((folder / CHECKSUM_FILE).read_text(encoding="utf-8"))["files"].items())
     except FileNotFoundError:
         return f"it has no {CHECKSUM_FILE}, so saving was interrupted"
-    except (OSError, ValueError, KeyError, TypeError):
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
         return f"its {CHECKSUM_FILE} cannot be read"
-    for name, expected in listed.items():
+    for name, expected in listed:
         path = folder / name
         if not path.is_file():
             return f"{name} is missing"
-        if _sha256(path) != expected:
+        try:
+            found = _sha256(path)
+        except OSError as error:
+            return f"{name} cannot be read ({error.strerror or error})"
+        if found != expected:
             return f"{name} has changed since it was written ({path.stat().st_size} bytes now)"
     return None
 

@@ -34,6 +34,7 @@ from muvo_jax.training import (
     together,
     validation,
 )
+from muvo_jax.training import step as step_lib
 
 _STEPS_LATE = 4  # a step is looked at when so many later ones run: what it copied to the host has arrived by then
 _MOST_SKIPPED = 10  # batches in a row: it is not the batches then
@@ -103,7 +104,8 @@ def train(job: Job, show: screen.Screen) -> Outcome:
     preparation.check_trainable(job.config)
     with concurrent.futures.ThreadPoolExecutor(1, "preparation") as background:
         early = background.submit(_prepare_early, job.config, job.frozen)
-        trained = fitting.OF_TRAINED if job.resume or job.init else ()
+        trained: tuple[str, ...] = fitting.OF_TRAINED if job.resume or job.init else ()
+        trained += ("train.observe_frames",) if job.resume else ()  # fitted or chosen when the run began
         config, recording, making_s = opening.open_data(job.config, job.open_recording, (*job.chosen, *trained), show)
         frames = pipeline.Frames(recording, config)
         source = _batches(frames, config)
@@ -129,7 +131,9 @@ def train(job: Job, show: screen.Screen) -> Outcome:
         run_folder.write_config(job.folder, config)
         files = run_folder.RunFolder(job.folder, done)
         validator = validation.Validator(ready.model, config, frames, job.frozen)
-        run = _Run(job, show, config, ready, keeper, files, validator, state, done, origin)
+        preparing_s = (ready.initialisation_s, ready.compilation_s)
+        run = _Run(job, show, config, ready.step, preparing_s, keeper, files, validator, state, done, origin)
+        del early, first, ready, state  # with a state of step 0, which is another one where a run goes on
         try:
             outcome = run.loop(source, making_s)
             keeper.close()
@@ -170,10 +174,10 @@ def _prepare_early(config: config_lib.Config,
 class _Run:
     """One run in progress."""
 
-    def __init__(self, job: Job, show: screen.Screen, config: config_lib.Config, ready: preparation.Prepared,
-                 keeper: checkpoint.Checkpoints, files: run_folder.RunFolder, validator: validation.Validator,
-                 state, done: int, origin: Mapping):
-        self.job, self.show, self.config, self.ready = job, show, config, ready
+    def __init__(self, job: Job, show: screen.Screen, config: config_lib.Config, step: step_lib.SpreadFunction,
+                 preparing_s: tuple[float, float], keeper: checkpoint.Checkpoints, files: run_folder.RunFolder,
+                 validator: validation.Validator, state, done: int, origin: Mapping):
+        self.job, self.show, self.config, self.step, self.preparing_s = job, show, config, step, preparing_s
         self.keeper, self.files, self.validator, self.origin = keeper, files, validator, origin
         self.state, self.done = state, done
         self.asked_to_save = done if keeper.saved is not None else None  # the step of the newest checkpoint or save
@@ -185,16 +189,16 @@ class _Run:
     def loop(self, source: pipeline.TrainBatches, making_s: float) -> Outcome:
         settings, pace = self.config.train, timing.Pace()
         traced = self.job.trace and together.is_first()
-        trace = timing.Trace(self.job.folder / run_folder.TRACE_FOLDER if traced else None)
-        placed = _Placed(source, self.ready.step.place)
-        feed = pipeline.prefetch_to_device(placed, self.ready.step.plan.batch_sharding)
+        trace = timing.Trace(self.job.folder.expanduser() / run_folder.TRACE_FOLDER if traced else None)
+        placed = _Placed(source, self.step.place)
+        feed = pipeline.prefetch_to_device(placed, self.step.plan.batch_sharding)
         with feed, together.StopRequest() as stop:
             self.show.start(settings.steps, self.done)
             while self.done < settings.steps and not stop.after(self.done):
                 trace.begin(len(self.step_times_s))
                 start_s, waited_s = time.perf_counter(), feed.waited_s
                 batch = next(feed)
-                self.state, metrics = self.ready.step(self.state, batch)
+                self.state, metrics = self.step(self.state, batch)
                 first = not self.step_times_s
                 self.done += 1
                 metrics["finite"].copy_to_host_async()
@@ -248,14 +252,21 @@ class _Run:
             f"step {step}: the loss is not finite: {', '.join(bad)}. "
             + (f"The last good checkpoint is of step {saved}, in {self.keeper.folder / str(saved)}."
                if saved is not None else "There is no checkpoint yet.")
-            + " Try a lower --learning-rate, or gradient clipping: --set optimizer.clip_norm=1. Where few batches are "
-              "bad, --set train.non_finite=skip leaves them out.")
+            + f" Try a lower --learning-rate, or {self._clipping()}. Where few batches are bad, --set "
+              f"train.non_finite=skip leaves them out.")
+
+    def _clipping(self) -> str:
+        norm = self.config.optimizer.clip_norm
+        if norm > 0.0:
+            return f"to clip gradients sooner than at {norm:g}: --set optimizer.clip_norm={norm / 10:g}"
+        return ("to clip gradients, in a run of its own (--init and a new --name go on from the weights): --set "
+                "optimizer.clip_norm=1")
 
     def _first_loss(self, loss: float, making_s: float) -> None:
-        ready = self.ready
+        initialisation_s, compilation_s = self.preparing_s
         self.show.line(f"first loss {loss:.4f} after {time.perf_counter() - self.job.started_s:.1f} s (data "
-                       f"{making_s:.1f} s, initialisation {ready.initialisation_s:.1f} s, compilation "
-                       f"{ready.compilation_s:.1f} s, first step {self.step_times_s[0]:.1f} s; data and compilation "
+                       f"{making_s:.1f} s, initialisation {initialisation_s:.1f} s, compilation "
+                       f"{compilation_s:.1f} s, first step {self.step_times_s[0]:.1f} s; data and compilation "
                        f"overlap where they can)")
 
     def _log(self, metrics: Mapping, figures: Mapping[str, float] | None) -> None:
@@ -322,14 +333,14 @@ class _Run:
             self.keeper.wait()
         if stopped and self.done < total:
             self.show.line(f"stopped at step {self.done} of {total}; saved. Go on with:  {self.job.resume_command}")
-        steady_s = self.step_times_s[1:]
-        if steady_s:
+        if self.step_times_s:
+            steady_s = self.step_times_s[1:] or self.step_times_s  # the first is no measure
             mean_s, age_s = sum(steady_s) / len(steady_s), time.perf_counter() - self.job.started_s
             self.show.line(f"{words.counted(len(self.step_times_s), 'step')}, {mean_s:.3f} s each on average; peak "
                            f"memory {host.peak_memory_gib():.2f} GiB; {screen.duration_text(age_s)} since the start")
             self.show.line(f"time went into {self.spent.text()}")
             self.files.log({"kind": "time", "step": self.done, **self.spent.seconds()})
-        elif not self.step_times_s:
+        else:
             self.show.line(f"nothing left to train: step {self.done} of {total} is reached (more with --steps).")
 
 

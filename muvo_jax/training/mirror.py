@@ -17,6 +17,7 @@ import numpy as np
 from muvo_jax import config as config_lib
 from muvo_jax import head as head_lib
 from muvo_jax import types
+from muvo_jax.model import world_model
 
 _SITE = 0x3D1F  # separates these draws from all others made with the same sample key
 _EGO = np.array([1.0, -1.0, 1.0, 1.0])  # x forward, y left, z up, and 1 or a range
@@ -84,9 +85,10 @@ def randomly(batch: types.Batch, keys: types.Array) -> types.Batch:
     return jax.tree.map(pick, mirrored(batch), batch)
 
 
-def check(model: config_lib.ModelConfig) -> None:
-    """Raises ValueError where a sensor or grid of the model has the car beside its middle: a flip is no mirror then."""
-    grid, aside = model.voxels, None
+def check(config: config_lib.Config) -> None:
+    """Raises ValueError where a sensor, grid or map of the model has the car beside its middle: a flip is no mirror."""
+    model, scale, aside = config.model, config.data.route_map, None
+    grid = model.voxels
     drawn = {head_lib.get(name).tokens for name in model.heads}
     middle_m = grid.origin_m[1] + 0.5 * grid.shape[1] * grid.voxel_size_m
     if "occupancy" in drawn and abs(middle_m) > _SYMMETRIC_M:
@@ -94,10 +96,14 @@ def check(model: config_lib.ModelConfig) -> None:
     lidar_m = model.range_view.position_m[1]
     if (model.lidar is not None or "range_view" in drawn) and abs(lidar_m) > _SYMMETRIC_M:
         aside = f"the lidar (model.range_view.position_m) lies at y = {lidar_m:g} m"
+    middle_px = world_model.ROUTE_MAP_SIZE[1] / 2
+    if model.route and abs(scale.ego_column - middle_px) * scale.metres_per_px > _SYMMETRIC_M:
+        aside = (f"in its route maps it stands at column {scale.ego_column:g} (data.route_map.ego_column), not at the "
+                 f"middle, {middle_px:g}")
     if aside:
         raise ValueError(f"augmentation.mirror=true exchanges left and right about the middle of the car, but {aside}. "
-                         f"Train without it (--set augmentation.mirror=false), or record with sensors and grids that "
-                         f"are symmetric about y = 0.")
+                         f"Train without it (--set augmentation.mirror=false), or record with sensors, grids and route "
+                         f"maps that are symmetric about y = 0.")
 
 
 def _intrinsics(matrix: types.Array, width_px: int) -> types.Array:

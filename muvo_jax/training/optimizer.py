@@ -74,6 +74,15 @@ def make_optimizer(config: config_lib.OptimizerConfig, total_steps: int, *,
     return clipped if leaf_by_leaf else packed(clipped)
 
 
+def with_constants(state: types.Array, fresh: types.Array) -> types.Array:
+    """An optimiser's state with the constants of a fresh one, as the settings have them now.
+
+    optax keeps decay, beta2 and epsilon in the state, where restored ones would win over what --resume --set says.
+    """
+    names = ("b2", "eps", "weight_decay")
+    return optax.tree_utils.tree_set(state, **{name: optax.tree_utils.tree_get(fresh, name) for name in names})
+
+
 def of_config(config: config_lib.Config) -> optax.GradientTransformation:
     """The optimiser of a run."""
     return make_optimizer(config.optimizer, config.train.steps, leaf_by_leaf=config.train.share_state)

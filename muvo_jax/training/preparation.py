@@ -30,6 +30,7 @@ class Prepared:
     """A run that only lacks data.
 
     Attributes:
+      config: it was made for.
       model: what is trained.
       state: at step 0, placed on the devices.
       step: function(state, placed batch) -> (state, metrics), compiled for `batch_shapes`.
@@ -37,6 +38,7 @@ class Prepared:
       initialisation_s, compilation_s: how long these two took.
     """
 
+    config: config_lib.Config
     model: world_model.WorldModel
     state: state_lib.TrainState
     step: step_lib.SpreadFunction
@@ -145,12 +147,14 @@ def prepare(config: config_lib.Config, batch_shapes: types.Batch,
     jitted: Any = step.compiled
     placed = parallel_lib.placed_batch_shapes(step.plan, batch_shapes, config.optimizer.accumulate)
     compiled = jitted.lower(state, placed).compile()
-    return Prepared(model, state, dataclasses.replace(step, compiled=compiled), batch_shapes,
+    return Prepared(config, model, state, dataclasses.replace(step, compiled=compiled), batch_shapes,
                     initialised_s - start_s, time.perf_counter() - initialised_s)
 
 
 def recompile(prepared: Prepared, config: config_lib.Config, batch_shapes: types.Batch,
               frozen: perceptual.FrozenEncoder | None = None) -> Prepared:
     """`prepared` where it already fits, else a new one for what the data turned out to be."""
-    same = prepared.model.config == config.model and prepared.batch_shapes == batch_shapes
+    on_this_data = dataclasses.replace(prepared.config, data=config.data, evaluation=config.evaluation)
+    same = (prepared.batch_shapes == batch_shapes and on_this_data == config
+            and prepared.config.data.route_map == config.data.route_map)  # which a mirrored window turns
     return prepared if same else prepare(config, batch_shapes, frozen)

@@ -7,10 +7,12 @@ import json
 import math
 import os
 import pathlib
+import time
 from collections.abc import Iterator, Mapping
 from typing import Any
 
-import tensorboardX
+from tensorboardX import event_file_writer, summary
+from tensorboardX.proto import event_pb2
 
 from muvo_jax import config as config_lib
 from muvo_jax.data import processes
@@ -34,25 +36,62 @@ class RunFolder:
         self._writes = together.is_first()
         if not self._writes:
             return
-        self._events = tensorboardX.SummaryWriter(str(self.path), purge_step=first_step or None)
-        self._metrics = (self.path / METRICS_FILE).open("a", encoding="utf-8")
+        with _writing(self.path / METRICS_FILE):
+            _end_line(self.path / METRICS_FILE)
+            self._metrics = (self.path / METRICS_FILE).open("a", encoding="utf-8")
+        # Not SummaryWriter, which waits for ever for its thread once that has died of a full disk.
+        with _writing(self.path):
+            self._events = event_file_writer.EventsWriter(str(self.path / "events"))
+            if first_step:  # TensorBoard then hides what an earlier start told of this step and later ones
+                started = event_pb2.SessionLog(status=event_pb2.SessionLog.START)
+                self._events.write_event(event_pb2.Event(step=first_step, session_log=started))
 
     def log(self, record: Mapping[str, Any]) -> None:
-        """Appends one record; finite numbers also go to TensorBoard as `kind/name`. What is not finite is null."""
+        """Appends one record; finite numbers also go to TensorBoard as `kind/name`. What is not finite is null.
+
+        Raises:
+          OSError: where it cannot be written, naming the file.
+        """
         if not self._writes:
             return
         clean = {name: _json_number(value) for name, value in record.items()}
-        self._metrics.write(json.dumps(clean) + "\n")
-        self._metrics.flush()
+        with _writing(self.path / METRICS_FILE):
+            self._metrics.write(json.dumps(clean) + "\n")
+            self._metrics.flush()
         prefix = "/".join(str(record[name]) for name in ("kind", "split") if name in record)
+        event = event_pb2.Event(wall_time=time.time(), step=record["step"])
         for name, value in record.items():
             if name != "step" and isinstance(value, (int, float)) and math.isfinite(value):
-                self._events.add_scalar(f"{prefix}/{name}", value, record["step"])
+                event.summary.value.extend(summary.scalar(f"{prefix}/{name}", value).value)
+        with _writing(self.path):
+            self._events.write_event(event)
+            self._events.flush()
 
     def close(self) -> None:
-        if self._writes:
-            self._metrics.close()
-            self._events.close()
+        """Safe after a failed `log`, too: what could not be written then is given up."""
+        for file in (self._metrics, self._events) if self._writes else ():
+            with contextlib.suppress(OSError):
+                file.close()
+
+
+@contextlib.contextmanager
+def _writing(path: pathlib.Path) -> Iterator[None]:
+    """Names the file of an error, which Python's do not."""
+    try:
+        yield
+    except OSError as error:
+        raise OSError(f"{path} cannot be written ({error.strerror or error}). Is the disk full, or the folder "
+                      f"read-only? Mend that and go on with --resume.") from error
+
+
+def _end_line(path: pathlib.Path) -> None:
+    """Ends a last line that was cut short, or the next record would be lost with it."""
+    if not path.is_file() or not path.stat().st_size:
+        return
+    with path.open("rb+") as file:
+        file.seek(-1, os.SEEK_END)
+        if file.read(1) != b"\n":
+            file.write(b"\n")
 
 
 @contextlib.contextmanager
@@ -77,6 +116,7 @@ def check_new(path: str | os.PathLike, again: str) -> None:
 
     Raises:
       FileExistsError: where it exists and is not empty; nothing in it is touched.
+      OSError: where no folder can be made there.
     """
     path = pathlib.Path(path).expanduser()
     if path.is_dir() and any(path.iterdir()):
@@ -86,6 +126,10 @@ def check_new(path: str | os.PathLike, again: str) -> None:
                               f"or start another one with  --name=SOMETHING_NEW")
     if path.exists() and not path.is_dir():
         raise FileExistsError(f"{path} is a file, expected a folder for the run: choose another --name.")
+    parent = next(parent for parent in (path, *path.absolute().parents) if parent.exists())
+    if not parent.is_dir() or not os.access(parent, os.W_OK | os.X_OK):
+        state = "cannot be written to" if parent.is_dir() else "is a file"
+        raise OSError(f"{parent} {state}, so that {path} cannot be made: choose another --runs-dir or --name.")
 
 
 def create(path: str | os.PathLike, config: config_lib.Config, again: str) -> None:
@@ -103,8 +147,9 @@ def write_config(path: str | os.PathLike, config: config_lib.Config) -> None:
         return
     target = pathlib.Path(path).expanduser() / CONFIG_FILE
     partial = target.with_name(CONFIG_FILE + ".part")
-    partial.write_text(json.dumps(config.to_dict(), indent=2) + "\n", encoding="utf-8")
-    partial.replace(target)
+    with _writing(target):
+        partial.write_text(json.dumps(config.to_dict(), indent=2) + "\n", encoding="utf-8")
+        partial.replace(target)
 
 
 def read_config(path: str | os.PathLike) -> config_lib.Config:
@@ -120,20 +165,22 @@ def read_config(path: str | os.PathLike) -> config_lib.Config:
     except FileNotFoundError as error:
         raise FileNotFoundError(f"{source} is missing, so there is no run to go on with in {path}. "
                                 f"Leave --resume away to start one.") from error
-    except json.JSONDecodeError as error:
+    except (json.JSONDecodeError, UnicodeDecodeError, RecursionError) as error:
         raise ValueError(f"{source} is not valid JSON ({error}). Every checkpoint holds a copy of the config: take it "
                          f"from {path}/{checkpoint.FOLDER}/STEP/meta.") from error
+    except ValueError as error:
+        raise ValueError(f"{source}: {error}") from error
 
 
 def read_metrics(path: str | os.PathLike) -> list[dict[str, Any]]:
-    """All records of a run, oldest first; a line cut short by a crash is left out."""
+    """All records of a run, oldest first; what is none, such as a line cut short by a crash, is left out."""
     source = pathlib.Path(path).expanduser() / METRICS_FILE
     records = []
-    for line in source.read_text(encoding="utf-8").splitlines() if source.is_file() else []:
-        try:
-            records.append(json.loads(line))
-        except json.JSONDecodeError:
-            continue
+    for line in source.read_text(encoding="utf-8", errors="replace").splitlines() if source.is_file() else []:
+        with contextlib.suppress(ValueError, RecursionError):
+            record = json.loads(line)
+            if isinstance(record, dict) and {"kind", "step"} <= record.keys():
+                records.append(record)
     return records
 
 
@@ -153,8 +200,9 @@ def forget_after(path: str | os.PathLike, step: int) -> int:
         return 0
     target = pathlib.Path(path).expanduser() / METRICS_FILE
     partial = target.with_name(METRICS_FILE + ".part")
-    partial.write_text("".join(json.dumps(record) + "\n" for record in kept), encoding="utf-8")
-    partial.replace(target)
+    with _writing(target):
+        partial.write_text("".join(json.dumps(record) + "\n" for record in kept), encoding="utf-8")
+        partial.replace(target)
     return len(records) - len(kept)
 
 

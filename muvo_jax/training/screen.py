@@ -11,6 +11,8 @@ import rich.console
 import rich.progress
 import rich.text
 
+_MOST_SAID = 600  # characters of another library's error
+
 
 class _Console(rich.console.Console):
     def on_broken_pipe(self) -> None:
@@ -113,3 +115,11 @@ def duration_text(seconds: float) -> str:
         return f"{seconds:.0f} s"
     minutes, rest = divmod(round(seconds), 60)
     return f"{minutes} min {rest} s" if minutes < 100 else f"{minutes // 60} h {minutes % 60} min"
+
+
+def said(error: BaseException) -> str:
+    """The kind of an error and its first line; of a very long one the middle is left out, for the cause stands last."""
+    line = (str(error).strip().splitlines() or ["no details"])[0].strip()
+    if len(line) > _MOST_SAID:
+        line = f"{line[:_MOST_SAID // 3]} ... {line[-2 * _MOST_SAID // 3:]}"
+    return f"{type(error).__name__}: {line}"

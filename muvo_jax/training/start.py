@@ -18,6 +18,7 @@ from muvo_jax.training import (
     transfer,
     validation,
 )
+from muvo_jax.training import optimizer as optimizer_lib
 from muvo_jax.training import state as state_lib
 
 Pretrained = Callable[[types.Variables, config_lib.ModelConfig], tuple[types.Variables, tuple[str, ...]]]
@@ -69,7 +70,8 @@ def resume(keeper: checkpoint.Checkpoints, show: screen.Screen, config: config_l
         show.warn(f"moved the damaged checkpoint to {moved}.")
     run_folder.forget_after(folder, restored.step)
     show.field("resumed", f"from step {restored.step}")
-    return restored.state, restored.step, restored.data_state
+    opt_state = optimizer_lib.with_constants(restored.state.opt_state, ready.state.opt_state)
+    return restored.state.replace(opt_state=opt_state), restored.step, restored.data_state
 
 
 def _from_run(run: pathlib.Path, show: screen.Screen, config: config_lib.Config, ready: preparation.Prepared,

@@ -62,8 +62,8 @@ def make_train_step(model: world_model.WorldModel, config: config_lib.Config, *,
 
     The metrics are float32 scalars: every loss term (unweighted), "total", "psnr_db" of the observed images,
     "learning_rate", the norms "gradient_norm", "parameter_norm", "update_norm" of what trains, and "finite" (1 or 0).
-    An update that is not finite is not applied, so the parameters stay usable (its "update_norm" is 0); the step is
-    counted.
+    An update that is not finite is not applied, so the parameters stay usable (its "update_norm" is 0, its rate that of
+    the update before); the step is counted.
 
     Args:
       model: what is trained.
@@ -73,12 +73,11 @@ def make_train_step(model: world_model.WorldModel, config: config_lib.Config, *,
       frozen: the network of the perceptual term, where that is on.
 
     Raises:
-      ValueError: for augmentation.mirror with sensors that are not symmetric.
+      ValueError: for augmentation.mirror with sensors or route maps that are not symmetric.
     """
     if config.augmentation.mirror:
-        mirror.check(config.model)
+        mirror.check(config)
     optimizer = optimizer_lib.of_config(config)
-    rate = optimizer_lib.learning_rate(config.optimizer, config.train.steps)
     norm = functools.partial(optimizer_lib.norm, leaf_by_leaf=config.train.share_state)
     gradients_of = gradient_body(model, config, frozen)
 
@@ -103,7 +102,7 @@ def make_train_step(model: world_model.WorldModel, config: config_lib.Config, *,
         # A branch, because XLA does all in it after the gradients. Outside it copies the moments and packs the
         # parameters as soon as it can, at the start of the step, and keeps the copies through all of it.
         (params, batch_stats_after, opt_state), norms = jax.lax.cond(finite, updated, kept)
-        metrics |= {"learning_rate": rate(state.step), "gradient_norm": gradient_norm,
+        metrics |= {"learning_rate": _applied_rate(opt_state), "gradient_norm": gradient_norm,
                     "finite": finite.astype(jnp.float32)} | norms
         return state.replace(step=state.step + 1, params=trainable.merge(params, frozen_params),
                              batch_stats=batch_stats_after, opt_state=opt_state), metrics
@@ -113,6 +112,12 @@ def make_train_step(model: world_model.WorldModel, config: config_lib.Config, *,
     spread = parallel_lib.spread(plan, gradients_of, then=update, shared=lambda state: split(state.params)[0],
                                  donate_state=True)
     return SpreadFunction(plan, config.optimizer.accumulate, spread)
+
+
+def _applied_rate(opt_state: Any) -> types.Array:
+    """Of the last update. `TrainState.step` does not tell it: that counts skipped steps too, the optimiser does not."""
+    is_value = lambda path, value: isinstance(value, jax.Array)  # beside it lies the state of its schedule
+    return optax.tree_utils.tree_get(opt_state, "learning_rate", filtering=is_value)
 
 
 def make_validation_step(model: world_model.WorldModel, config: config_lib.Config, *, batch_size: int | None = None,

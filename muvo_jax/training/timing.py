@@ -99,16 +99,18 @@ class Trace:
     """JAX's profiler, on for the steps TRACED; off without a folder."""
 
     def __init__(self, folder: pathlib.Path | None):
-        self._folder, self._on = folder, False
+        self._folder, self._on, self._begun = folder, False, False
 
     def begin(self, step: int) -> None:
         """Before a step, the first of a start being 0."""
         if self._folder is not None and step == TRACED.start:
             jax.profiler.start_trace(self._folder)
-            self._on = True
+            self._on = self._begun = True
 
     def end(self, step: int | None, results: Any) -> str | None:
         """After a step, or after the last one (None): what to tell the user once the trace is written."""
+        if step is None and self._folder is not None and not self._begun:
+            return f"nothing was traced: steps {TRACED.start + 1} to {TRACED.stop} are, and there were fewer"
         if not self._on or (step is not None and step + 1 < TRACED.stop):
             return None
         jax.block_until_ready(results)

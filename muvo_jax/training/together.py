@@ -5,6 +5,7 @@ All of them compute every step; the first one writes what a run leaves, beside t
 
 from __future__ import annotations
 
+import collections
 import contextlib
 import dataclasses
 import hashlib
@@ -16,11 +17,13 @@ import signal
 import socket
 import sys
 import threading
+import time
 from collections.abc import Iterator, Mapping
 from typing import Any, NoReturn, TypeVar
 
 import jax
 import numpy as np
+import orbax.checkpoint as ocp
 from jax.experimental import multihost_utils
 
 from muvo_jax.training import screen
@@ -29,6 +32,7 @@ WAIT_S = 45.0  # for a coordinator, before a host says that there is none
 WAIT_FOR_ALL_S = 300.0  # for hosts that start late, as where images are still pulled
 _HEARTBEAT_S = 45  # a host that is silent for so long is lost; a starved machine may well be for 30
 _DAY_S = 24 * 3600  # hosts wait so long at the end for the first one, which evaluates
+_LAST_WORDS_S = 5.0  # the others end as soon as host 0 has, whatever they were about to say
 _AUTO = "auto"
 _LOSS = re.compile("Gloo|NCCL|RCCL|coordination service|UNAVAILABLE|DEADLINE_EXCEEDED|ABORTED")
 _Value = TypeVar("_Value")
@@ -66,12 +70,16 @@ def launch_of(hosts: str | None, host: int | None, coordinator: str | None) -> L
     if hosts == "1" and host in (None, 0):
         return None
     if (hosts is None or not hosts.isdecimal() or host is None or host >= int(hosts) or coordinator is None
-            or not coordinator.rpartition(":")[0] or not coordinator.rpartition(":")[2].isdecimal()):
+            or not coordinator.rpartition(":")[0] or not _is_port(coordinator.rpartition(":")[2])):
         raise ValueError(f"--hosts={hosts} --host={host} --coordinator={coordinator}: expected --hosts=auto in a job "
                          f"of SLURM, Kubernetes, Open MPI or Cloud TPU, or all three: --hosts=COUNT, --host=INDEX from "
                          f"0 to COUNT - 1, and --coordinator=ADDRESS:PORT of host 0, the same for all "
                          f"(docs/cluster.md).")
     return Launch(int(hosts), host, coordinator)
+
+
+def _is_port(text: str) -> bool:
+    return text.isdecimal() and 0 < int(text) < 2**16
 
 
 def join(launch: Launch, show: screen.Screen) -> None:
@@ -82,6 +90,7 @@ def join(launch: Launch, show: screen.Screen) -> None:
 
     Raises:
       ValueError: where JAX recognises no cluster.
+      OSError: where host 0 cannot listen at its address.
     """
     joined = threading.Event()
     threading.Thread(target=_lose_patience, args=(launch, joined), daemon=True).start()
@@ -94,6 +103,9 @@ def join(launch: Launch, show: screen.Screen) -> None:
     except ValueError as error:
         raise ValueError(f"--hosts=auto: JAX recognises no job of SLURM, Kubernetes, Open MPI or Cloud TPU here "
                          f"({error}) Say it with --hosts=COUNT --host=INDEX --coordinator=ADDRESS:PORT.") from error
+    except jax.errors.JaxRuntimeError as error:
+        raise OSError(f"host {launch.host} of {launch.hosts} cannot take part at {launch.coordinator}: is that port "
+                      f"taken? Choose a free one for all hosts. ({screen.said(error)})") from error
     finally:
         joined.set()
     show.console.quiet = not is_first()
@@ -133,6 +145,7 @@ def leave(code: int) -> int:
     if code and jax.distributed.is_initialized():
         sys.stdout.flush()
         sys.stderr.flush()
+        time.sleep(_LAST_WORDS_S if is_first() else 0.0)
         os._exit(code)
     return code
 
@@ -161,6 +174,40 @@ def gather(value: _Value) -> list[_Value]:
 def any_of(flag: bool) -> bool:
     """Whether the flag is set in any process; to be called by all of them."""
     return any(gather(flag))
+
+
+class SavingBarrier:
+    """Where hosts that save together wait for each other (ocp.options.BarrierSyncFn).
+
+    A host that comes here with an error on its way, its disk being full, says so, and all the others fail with it.
+    Orbax's own barrier would let everybody wait, that host too, for twenty minutes.
+    """
+
+    _FOLDER, _FAILED, _LOOK_S = "muvo_jax_saves", "muvo_jax_failed_saves", 0.05
+
+    def __init__(self):
+        self._visits: collections.Counter[str] = collections.Counter()
+
+    def __call__(self, *, key: str, timeout_ms: int) -> None:
+        """Returns once all hosts have called it as often with this key.
+
+        Raises:
+          OSError: where the saving of one has failed, naming it and its reason.
+          TimeoutError: where not all have come in time.
+        """
+        client, host = ocp.multihost.get_jax_distributed_client(), jax.process_index()
+        error = sys.exc_info()[1]  # Orbax comes here in `finally`
+        if error is not None and not client.key_value_dir_get(self._FAILED):
+            client.key_value_set(f"{self._FAILED}/{host}", f"host {host}: {screen.said(error)}")
+        self._visits[key] += 1
+        place, end_s = f"{self._FOLDER}/{key}/{self._visits[key]}", time.monotonic() + timeout_ms / 1000.0
+        client.key_value_set(f"{place}/{host}", "here")
+        while len(client.key_value_dir_get(place)) < jax.process_count():
+            if failed := client.key_value_dir_get(self._FAILED):
+                raise OSError("; ".join(reason for _, reason in failed))
+            if time.monotonic() > end_s:
+                raise TimeoutError(f"not all {jax.process_count()} hosts have saved after {timeout_ms / 1000.0:.0f} s")
+            time.sleep(self._LOOK_S)
 
 
 def check_same(facts: Mapping[str, Any]) -> None:

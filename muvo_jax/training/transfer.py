@@ -12,6 +12,7 @@ from muvo_jax import config as config_lib
 from muvo_jax import run as run_lib
 from muvo_jax import types
 from muvo_jax.data import pipeline
+from muvo_jax.model import world_model
 from muvo_jax.training import checkpoint_meta, first_guess, validation
 
 
@@ -31,7 +32,30 @@ def to_recording(loaded: run_lib.Run, config: config_lib.Config, wanted: types.V
     Raises:
       ValueError: naming both networks where they differ in anything else.
     """
-    fresh = {f"decoders_{head}" for head in config.model.heads if head not in loaded.config.model.heads}
+    params = _taken(loaded, config, wanted)
+    fresh = _fresh(loaded, config)
+    measured = first_guess.measured(validation.training_sums(frames), config.model)
+    stats = {name: {**(value if name in fresh else loaded.variables["batch_stats"].get(name, {})),
+                    **measured.get(name, {})} for name, value in wanted["batch_stats"].items()}
+    return {"params": params, "batch_stats": stats}
+
+
+def check(loaded: run_lib.Run, config: config_lib.Config) -> None:
+    """Refuses a config whose network cannot start from a run, by shapes alone: before there is data or a step.
+
+    Raises:
+      ValueError: as `to_recording`.
+    """
+    _taken(loaded, config, world_model.WorldModel(config.model).variable_shapes())
+
+
+def _fresh(loaded: run_lib.Run, config: config_lib.Config) -> set[str]:
+    return {f"decoders_{head}" for head in config.model.heads if head not in loaded.config.model.heads}
+
+
+def _taken(loaded: run_lib.Run, config: config_lib.Config, wanted: types.Variables) -> dict[str, Any]:
+    """The parameters of the new network, checked: those of the run, and those of `wanted` where a head is new."""
+    fresh = _fresh(loaded, config)
     old = loaded.variables["params"]
     params = {name: value if name in fresh else old[name] for name, value in wanted["params"].items()
               if name in fresh or name in old}
@@ -41,10 +65,7 @@ def to_recording(loaded: run_lib.Run, config: config_lib.Config, wanted: types.V
         params["fusion"] = {**params["fusion"], "type_embedding": params["fusion"]["type_embedding"][rows]}
     if config.model.numerics != loaded.config.model.numerics or shapes(params) != shapes(wanted["params"]):
         checkpoint_meta.check_architecture(config, loaded.config, str(loaded.folder))
-    measured = first_guess.measured(validation.training_sums(frames), config.model)
-    stats = {name: {**(value if name in fresh else loaded.variables["batch_stats"].get(name, {})),
-                    **measured.get(name, {})} for name, value in wanted["batch_stats"].items()}
-    return {"params": params, "batch_stats": stats}
+    return params
 
 
 def shapes(tree: Mapping[str, Any]) -> Any:

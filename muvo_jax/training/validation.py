@@ -100,17 +100,20 @@ def windows(frames: pipeline.Frames, split: str, count: int,
 def windows_of_run(run: run_lib.Run | str | os.PathLike, split: str | None = None, *, count: int,
                    frames: int | None = None) -> types.Batch:
     """See muvo_jax.windows."""
+    if count < 1 or (frames is not None and frames < 1):
+        raise ValueError(f"windows: count is {count}, frames is {frames}; expected whole numbers of 1 or more, or no "
+                         f"frames for context + horizon.")
     config = (run if isinstance(run, run_lib.Run) else checkpoint.load_run(run)).config
     recording = recordings.open_configured(config, split=split or recordings.HELD_OUT)
     held_out = [name for name in recording.description.splits if name != "train"]
     split = split or (held_out or ["train"])[0]
     fitted = fitting.adapt(config, recording, keep=fitting.OF_TRAINED).config
-    entry = next(pipeline.evaluation_batches(pipeline.Frames(recording, fitted), split, windows=count, length=frames,
-                                             batch=count))
-    if entry.count < count:
-        raise schema.DataError(f"split {split!r} of {recording.description.name!r} has {entry.count} windows of "
-                               f"{entry.batch.frames} frames, {count} were asked for. Ask for fewer or shorter ones.")
-    return entry.batch
+    source, length = pipeline.Frames(recording, fitted), frames or fitted.data.context + fitted.data.horizon
+    found = len(pipeline.evaluation_windows(source, split, windows=count, length=length))
+    if found < count:
+        raise schema.DataError(f"split {split!r} of {recording.description.name!r} has {found} windows of {length} "
+                               f"frames, {count} were asked for. Ask for fewer or shorter ones.")
+    return next(pipeline.evaluation_batches(source, split, windows=count, length=length, batch=count)).batch
 
 
 def sample_scores(run: run_lib.Run, count: int) -> dict[str, float]:

@@ -3,10 +3,12 @@
     python small_run.py [FLAGS OF TRAIN]
 
 $KILL_AT names a moment at which the process kills itself: step, evaluation or save, and how many of these it survives:
-"save:1". $STOP_AT=3 sends SIGTERM after that step, twice.
+"save:1". $STOP_AT=3 sends SIGTERM after that step, twice. $FULL_AT=1: from the second save on its disk is full.
 """
 
+import itertools
 import os
+import resource
 import signal
 import sys
 import time
@@ -16,7 +18,7 @@ import test_loop
 
 from muvo_jax import recordings, train
 from muvo_jax.model import world_model
-from muvo_jax.training import integrity, parallel, run_folder, validation
+from muvo_jax.training import checkpoint, integrity, parallel, run_folder, validation
 from muvo_jax.training import step as step_lib
 
 FLAGS = ("--preset=tiny", "--data=/memory", "--heads=image,action", "--frames=3", "--stride=1", "--context=2",
@@ -28,18 +30,29 @@ class Recording(test_loop.MemoryRecording):
     """Named like the folder, of which there is none."""
 
 
-def dying(function, moment):
-    """`function`, before which the process kills itself where $KILL_AT says so."""
-    name, _, survived = os.environ.get("KILL_AT", "").partition(":")
-    calls = []
+def failing(function, fault, survived):
+    """`function`, before which `fault()` happens from the call on that follows `survived` others (None: never)."""
+    calls = itertools.count()
 
     def called(*arguments, **options):
-        calls.append(None)
-        if name == moment and len(calls) > int(survived or 0):
-            os.kill(os.getpid(), signal.SIGKILL)
+        if survived is not None and next(calls) >= survived:
+            fault()
         return function(*arguments, **options)
 
     return called
+
+
+def killed():
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+def disk_full():
+    resource.setrlimit(resource.RLIMIT_FSIZE, (1000, resource.RLIM_INFINITY))
+
+
+def dying(function, moment):
+    name, _, survived = os.environ.get("KILL_AT", "").partition(":")
+    return failing(function, killed, int(survived or 0) if name == moment else None)
 
 
 def stopping(log):
@@ -63,6 +76,8 @@ if __name__ == "__main__":
     step_lib.SpreadFunction.__call__ = dying(step_lib.SpreadFunction.__call__, "step")
     validation.Validator.run = dying(validation.Validator.run, "evaluation")
     integrity.seal = dying(integrity.seal, "save")
+    full_at = int(os.environ.get("FULL_AT", "1000"))
+    checkpoint.Checkpoints.save = failing(checkpoint.Checkpoints.save, disk_full, full_at)
     run_folder.RunFolder.log = stopping(run_folder.RunFolder.log)
     sys.argv[1:] = [*FLAGS, *sys.argv[1:]]
     sys.exit(train.main())

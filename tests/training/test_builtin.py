@@ -24,6 +24,15 @@ def sealed(tmp_path, monkeypatch):
     return run
 
 
+def test_a_step_may_be_named_in_words_and_windows_are_counted_before_they_are_read(sealed):
+    assert muvo_jax.load("builtin:small", "7").step == 7
+    with pytest.raises(checkpoint.CheckpointError, match="has step 7 alone, not 8"):
+        muvo_jax.load("builtin:small", "8")
+    for count, frames in ((0, None), (2, 0), (2, -3)):
+        with pytest.raises(ValueError, match=f"count is {count}, frames is {frames}; expected whole numbers"):
+            muvo_jax.windows("builtin:small", count=count, frames=frames)
+
+
 def test_a_sealed_run_comes_back_with_parameters_to_eight_bits(sealed):
     loaded = muvo_jax.load("builtin:small")
     assert loaded.config == sealed.config and loaded.step == 7 and loaded.folder.name == "builtin-small"

@@ -20,7 +20,7 @@ import muvo_jax
 from muvo_jax import config as config_lib
 from muvo_jax import presets
 from muvo_jax.model import world_model
-from muvo_jax.training import checkpoint, checkpoint_meta, integrity, optimizer, run_folder, state
+from muvo_jax.training import checkpoint, checkpoint_meta, integrity, optimizer, state
 
 ROOT = pathlib.Path(muvo_jax.__file__).parents[1]
 
@@ -61,6 +61,13 @@ def _save(folder, fresh, config, *steps, **options):
                     provenance={"name": "town"})
     keeper.wait()
     return keeper
+
+
+def test_a_run_that_clips_gradients_goes_on_as_one_that_does(config, fresh, tmp_path):
+    _save(tmp_path, fresh, config, 1)
+    clipping = config_lib.override(config, "optimizer.clip_norm", 1.0)
+    with pytest.raises(ValueError, match=r"trained with optimizer\.clip_norm=0\.0, and cannot go on with 1\.0.*--init"):
+        checkpoint.Checkpoints(tmp_path).restore_latest(_fresh(clipping), clipping)
 
 
 def test_round_trip_restores_every_leaf_the_typed_key_and_the_data_position(tmp_path, fresh, config):
@@ -174,6 +181,14 @@ def test_keeps_the_last_and_the_best(tmp_path, fresh, config):
     assert checkpoint.load_run(tmp_path, 4).step == 4
     with pytest.raises(checkpoint.CheckpointError, match="no step 3; it has 2, 4, 5"):
         checkpoint.load_run(tmp_path, 3)
+
+
+def test_where_nothing_has_a_score_the_newest_is_said_to_be_the_best(tmp_path, fresh, config):
+    keeper = checkpoint.Checkpoints(tmp_path)
+    keeper.save(1, fresh, config=config)
+    keeper.close()
+    loaded = checkpoint.load_run(tmp_path, "best")
+    assert loaded.step == 1 and "has a score; the newest is taken for the best" in loaded.warnings[0]
 
 
 def test_load_gives_the_model_and_its_variables(tmp_path, fresh, config):
@@ -312,16 +327,9 @@ def test_a_clock_that_was_set_back_changes_nothing(tmp_path, fresh, config, monk
     assert keeper.steps() == [1, 3, 4] and checkpoint.load_run(tmp_path).step == 4
 
 
-def test_run_folder_refuses_what_exists_and_forgets_later_records(tmp_path, config):
-    run_folder.create(tmp_path / "run", config, "again")
-    assert run_folder.read_config(tmp_path / "run") == config
-    with pytest.raises(FileExistsError, match="Go on with it:  again"):
-        run_folder.create(tmp_path / "run", config, "again")
-    files = run_folder.RunFolder(tmp_path / "run")
-    for step in (1, 2, 3):
-        files.log({"kind": "train", "step": step, "total": float("nan") if step == 2 else 1.0})
-    files.close()
-    assert run_folder.forget_after(tmp_path / "run", 2) == 1
-    assert [record["total"] for record in run_folder.read_metrics(tmp_path / "run")] == [1.0, None]
-    with pytest.raises(FileNotFoundError, match="no run to go on with"):
-        run_folder.read_config(tmp_path / "other")
+@pytest.mark.parametrize("files", [[], None, 3, "text"])
+def test_a_list_of_checksums_that_is_none_is_damage(tmp_path, fresh, config, files):
+    keeper = _save(tmp_path, fresh, config, 1, 2)
+    (tmp_path / "checkpoints/2/checksums.json").write_text(json.dumps({"files": files}))
+    restored = keeper.restore_latest(fresh, config)
+    assert restored.step == 1 and "checksums.json cannot be read" in restored.warnings[0]

@@ -4,8 +4,9 @@ import jax
 import pytest
 from test_loop import Interrupting, MemoryRecording, SmallWorld, _config
 
+from muvo_jax import config as config_lib
 from muvo_jax.model import world_model
-from muvo_jax.training import loop
+from muvo_jax.training import loop, preparation
 from muvo_jax.training import step as step_lib
 
 
@@ -40,3 +41,22 @@ def test_the_step_is_compiled_once_and_nothing_after_the_first_validation(tmp_pa
     assert "compiled" not in happened[steps[0]:steps[1]]
     second = next(index for index in validations if index > steps[3])  # of step 4; the first was of step 2
     assert "compiled" not in happened[steps[2]:second + 1]
+
+
+def test_an_early_step_is_taken_only_where_the_data_changed_none_of_its_settings():
+    config = _config()
+    shapes = preparation.expected_batch(config, 2)
+    early = preparation.Prepared(config, None, None, None, shapes, 0.0, 0.0)
+    anew = object()
+    patch = pytest.MonkeyPatch()
+    patch.setattr(preparation, "prepare", lambda *_: anew)
+    try:
+        elsewhere = config_lib.override_all(config, {"data.path": "other", "evaluation.windows": 3})
+        assert preparation.recompile(early, elsewhere, shapes) is early
+        for name, value in (("train.observe_frames", 1), ("loss.kl", 0.5), ("augmentation.mirror", True),
+                            ("data.route_map.metres_per_px", 0.9)):
+            changed = config_lib.override_all(config, {name: value})
+            assert preparation.recompile(early, changed, shapes) is anew, name
+        assert preparation.recompile(early, config, preparation.expected_batch(config, 3)) is anew
+    finally:
+        patch.undo()

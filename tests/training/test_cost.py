@@ -86,3 +86,16 @@ def test_the_command_says_what_is_needed_what_fits_and_that_nothing_does(monkeyp
     assert "--batch=16 --accumulate=1 --set train.remat=none" in capsys.readouterr().out
     with pytest.raises(ValueError, match="not even one window at a time fits"):
         estimate.estimate(dataclasses.replace(options, memory_gib=0.0), screen.Screen())
+
+
+def test_a_batch_that_devices_cannot_share_evenly_is_looked_at_before_it_is_named(monkeypatch):
+    """Two of eight devices hold a window each: a size of its own says nothing of the next one."""
+    def of_config(config):
+        on = max(size for size in range(1, 9) if config.train.batch % size == 0)
+        return dataclasses.replace(COST, state_bytes=100, batch_bytes=0, working_bytes=40 * config.train.batch // on)
+
+    monkeypatch.setattr(estimate, "of_config", of_config)
+    monkeypatch.setattr(jax, "device_count", lambda: 8)
+    config = config_lib.override_all(presets.get("paper"), {"optimizer.accumulate": 36})
+    fits = estimate.suggest(config, 220.0, fixed=True)
+    assert of_config(fits).total_bytes <= 220 and (fits.train.batch, fits.optimizer.accumulate) == (18, 2)

@@ -162,6 +162,20 @@ def test_some_steps_are_traced_where_asked_for(tmp_path):
     written = list((tmp_path / "run" / run_folder.TRACE_FOLDER).rglob("*.xplane.pb"))
     assert len(written) == 1 and written[0].stat().st_size > 1000
     assert show.output.getvalue().count("traced steps into") == 1
+    show = Interrupting()
+    _train(tmp_path / "short", show, config=_config(steps=2), trace=True)
+    assert "nothing was traced: steps 4 to 8 are" in show.output.getvalue()
+
+
+def test_how_many_frames_are_observed_stays_as_a_run_began(tmp_path):
+    """Fitting takes no more than evaluation observes, unless more were chosen; --resume must not fit anew."""
+    folder = tmp_path / "run"
+    _train(folder, config=_config(steps=2, observe_frames=3), chosen=("train.observe_frames",))
+    assert run_folder.read_config(folder).train.observe_frames == 3
+    stored = run_folder.read_config(folder)
+    longer = dataclasses.replace(stored, train=dataclasses.replace(stored.train, steps=3))
+    outcome = _train(folder, config=longer, resume=True, chosen=("train.steps",))
+    assert outcome.config.train.observe_frames == 3
 
 
 def test_validation_reports_loss_and_imagined_scores(uninterrupted):

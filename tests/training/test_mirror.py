@@ -164,8 +164,13 @@ def test_training_sees_it_and_validation_does_not():
 @pytest.mark.parametrize(("field", "value", "message"), [
     ("model.range_view.position_m", (1.0, 0.4, 2.0), r"the lidar \(model.range_view.position_m\) lies at y = 0.4 m"),
     ("model.voxels.origin_m", (-16.0, -15.0, -3.0), "the middle of model.voxels lies at y = 1 m"),
+    ("data.route_map.ego_column", 20.0, r"column 20 \(data.route_map.ego_column\), not at the middle, 32"),
 ])
 def test_sensors_that_are_not_symmetric_are_refused_before_compilation(field, value, message):
     config = config_lib.override_all(presets.tiny(), {"augmentation.mirror": True, field: value})
     with pytest.raises(ValueError, match=message):
         step_lib.make_train_step(small_world.SmallWorld(config.model), config)
+
+
+def test_where_the_car_stands_in_route_maps_that_are_not_read_does_not_matter():
+    mirror.check(config_lib.override_all(presets.tiny(), {"model.route": False, "data.route_map.ego_column": 20.0}))

@@ -107,3 +107,21 @@ def test_clipping_limits_the_global_norm():
         moments = [leaf for path, leaf in jax.tree_util.tree_leaves_with_path(state)
                    if "nu" in jax.tree_util.keystr(path)]
         np.testing.assert_allclose(sum(moment.sum() for moment in moments), expected * (1 - CONFIG.beta2), rtol=1e-3)
+
+
+def test_a_state_takes_the_constants_of_todays_settings():
+    """optax keeps them in the state: restored ones would win."""
+    before, now = (config_lib.OptimizerConfig(weight_decay=decay, beta2=beta2, clip_norm=1.0)
+                   for decay, beta2 in ((0.01, 0.99), (0.5, 0.9)))
+    params = {"kernel": jnp.ones((3, 2)), "bias": jnp.ones(2)}
+    gradients = jax.tree.map(lambda leaf: 0.1 * leaf, params)
+    old, new = (optimizer_lib.make_optimizer(config, 10) for config in (before, now))
+    state = old.update(gradients, old.init(params), params)[1]
+    resumed = optimizer_lib.with_constants(state, new.init(params))
+    assert jax.tree.structure(resumed) == jax.tree.structure(state)
+    found = optax.tree_utils.tree_get(resumed, "weight_decay"), optax.tree_utils.tree_get(resumed, "b2")
+    np.testing.assert_allclose(found, (0.5, 0.9))
+    np.testing.assert_array_equal(optax.tree_utils.tree_get(resumed, "mu")["decayed"],
+                                  optax.tree_utils.tree_get(state, "mu")["decayed"])
+    moved = new.update(gradients, resumed, params)[0]["kernel"] - new.update(gradients, state, params)[0]["kernel"]
+    assert np.abs(moved).min() > 0.0

@@ -200,6 +200,26 @@ def test_a_loss_that_is_not_finite_changes_nothing_but_the_step():
     jax.tree.map(np.testing.assert_array_equal, after.variables, state.variables)
 
 
+def test_the_logged_rate_is_the_applied_one_after_a_skipped_step_too():
+    _, config, batch, state = setting(heads=FEW)
+    broken = batch.replace(action=np.full_like(batch.action, np.nan))
+    logged, state = [], copy_of(state)
+    for given in (batch, broken, batch):
+        state, metrics = compiled_step()(state, given)
+        logged.append(float(metrics["learning_rate"]))
+    rate = optimizer_lib.learning_rate(config.optimizer, config.train.steps)
+    np.testing.assert_allclose(logged, [rate(0), rate(0), rate(1)], rtol=1e-6)
+    assert logged[1] != logged[2] == float(state.opt_state.hyperparams["learning_rate"])
+
+
+@pytest.mark.parametrize("leaf_by_leaf", [False, True])
+def test_the_rate_is_found_behind_clipping(leaf_by_leaf):
+    config = config_lib.OptimizerConfig(clip_norm=1.0)
+    optimizer = optimizer_lib.make_optimizer(config, 10, leaf_by_leaf=leaf_by_leaf)
+    state = optimizer.init({"kernel": jnp.ones((2, 2)), "bias": jnp.ones(2)})
+    np.testing.assert_allclose(step_lib._applied_rate(state), optimizer_lib.learning_rate(config, 10)(0), rtol=1e-6)
+
+
 def test_validation_agrees_over_devices_and_neither_drops_out_nor_learns():
     model, config, batch, state = setting(1, FEW)
     validate = {count: step_lib.make_validation_step(model, config, devices=jax.devices()[:count]) for count in (1, 4)}

@@ -6,9 +6,11 @@ import signal
 import subprocess
 import sys
 
+import jax
+import orbax.checkpoint as ocp
 import pytest
 
-from muvo_jax.training import together
+from muvo_jax.training import screen, together
 
 ROOT = pathlib.Path(__file__).parents[2]
 ALONE = """
@@ -58,7 +60,53 @@ def test_a_second_sigterm_lets_a_run_save_and_a_second_ctrl_c_interrupts_it():
             signal.raise_signal(signal.SIGINT)
 
 
+class _Client:
+    """The store of jax.distributed, as one host alone has it."""
+
+    def __init__(self):
+        self.values = {}
+
+    def key_value_set(self, key, value):
+        assert key not in self.values
+        self.values[key] = value
+
+    def key_value_dir_get(self, folder):
+        return [(key, value) for key, value in self.values.items() if key.startswith(f"{folder}/")]
+
+
+def test_who_comes_to_the_barrier_of_saving_with_an_error_ends_it_for_all(monkeypatch):
+    client, barrier = _Client(), together.SavingBarrier()
+    monkeypatch.setattr(ocp.multihost, "get_jax_distributed_client", lambda: client)
+    for _ in range(2):
+        barrier(key="written", timeout_ms=1000)
+    monkeypatch.setattr(jax, "process_count", lambda: 2)
+    with pytest.raises(TimeoutError, match="not all 2 hosts have saved"):
+        barrier(key="written", timeout_ms=100)
+    with pytest.raises(OSError, match="host 0: OSError: no space"):
+        try:
+            raise OSError("no space")
+        finally:
+            barrier(key="committed", timeout_ms=1000)
+    with pytest.raises(OSError, match=r"host 0: OSError: no space$"):  # and no other save may begin
+        barrier(key="written", timeout_ms=1000)
+
+
 def test_one_process_is_all_of_them():
     assert together.is_first() and together.gather({"a": 1}) == [{"a": 1}] and not together.any_of(False)
     together.wait_for_all("nobody")
     together.check_same({"settings": 1})
+
+
+@pytest.mark.parametrize("port", ["0", "65536", "99999"])
+def test_a_port_is_one(port):
+    with pytest.raises(ValueError, match="--coordinator=ADDRESS:PORT"):
+        together.launch_of("2", 0, f"localhost:{port}")
+
+
+def test_a_coordinator_whose_port_is_taken_is_told(monkeypatch):
+    def taken(*_, **__):
+        raise jax.errors.JaxRuntimeError("UNKNOWN: Failed to start RPC server")
+
+    monkeypatch.setattr(jax.distributed, "initialize", taken)
+    with pytest.raises(OSError, match=r"host 0 of 2 cannot take part at localhost:80: is that port taken\?"):
+        together.join(together.Launch(2, 0, "localhost:80"), screen.Screen())

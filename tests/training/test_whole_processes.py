@@ -3,6 +3,7 @@
 import json
 import os
 import pathlib
+import re
 import signal
 import socket
 import subprocess
@@ -32,7 +33,8 @@ def environment(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def start(environment, tmp_path_factory):
-    """start(folder, *flags, hosts=1, KILL_AT={host: moment}, STOP_AT=...) -> processes, ended with the test."""
+    """start(folder, *flags, hosts=1, KILL_AT={host: moment}, STOP_AT=..., FULL_AT=...) -> processes, ended with the
+    test."""
     running = []
 
     def begin(folder, *flags, hosts=1, **moments):
@@ -41,7 +43,8 @@ def start(environment, tmp_path_factory):
             port = free.getsockname()[1]
         processes = []
         for host in range(hosts):
-            variables = environment | {"XLA_FLAGS": f"--xla_force_host_platform_device_count={DEVICES // hosts}"}
+            devices = max(1, DEVICES // hosts)
+            variables = environment | {"XLA_FLAGS": f"--xla_force_host_platform_device_count={devices}"}
             variables |= {name: of_hosts[host] for name, of_hosts in moments.items() if host in of_hosts}
             together = (f"--hosts={hosts}", f"--host={host}", f"--coordinator=localhost:{port}") if hosts > 1 else ()
             processes.append(subprocess.Popen(
@@ -59,6 +62,15 @@ def ended(processes):
     """Their exit codes and what they printed."""
     texts = [process.communicate(timeout=60 * MINUTES)[0] for process in processes]
     return [process.returncode for process in processes], texts
+
+
+def others_end(processes, first):
+    """`ended`, once that one is gone; the others must be within a minute."""
+    processes[first].wait(60 * MINUTES)
+    gone_s = time.monotonic()
+    result = ended(processes)
+    assert time.monotonic() - gone_s < 60.0
+    return result
 
 
 def logged(folder):
@@ -115,14 +127,28 @@ def test_two_hosts_train_as_one_stop_together_and_one_goes_on_without_the_other(
     assert stopped_at < 4 and f"stopped at step {stopped_at} of 6; saved" in texts[0], texts
     assert_close(logged(folder), alone[:len(logged(folder))])
 
-    processes = start(folder, "--resume", hosts=2, KILL_AT={1: "step:1"})
-    processes[1].wait(60 * MINUTES)
-    lost_s = time.monotonic()
-    codes, texts = ended(processes)
-    assert time.monotonic() - lost_s < 60.0
+    codes, texts = others_end(start(folder, "--resume", hosts=2, KILL_AT={1: "step:1"}), first=1)
     assert codes == [1, -signal.SIGKILL]
     assert "most likely another host has ended" in texts[0] and "--resume" in texts[0], texts
 
     codes, texts = ended(start(folder, "--resume"))
     assert codes == [0], texts
+    assert_close(logged(folder), alone)
+
+
+def test_of_four_hosts_one_is_killed_and_another_has_a_full_disk_and_two_go_on(start, alone, tmp_path):
+    folder = tmp_path / "run"
+    codes, texts = others_end(start(folder, f"--steps={STEPS}", hosts=4, KILL_AT={2: "step:4"}), first=2)
+    assert codes == [1, 1, -signal.SIGKILL, 1], texts
+    assert all("most likely another host has ended" in texts[host] and "--resume" in texts[host] for host in (0, 1, 3))
+
+    processes = start(folder, "--resume", hosts=4, FULL_AT={3: "0"})
+    codes, texts = others_end(processes, first=3)
+    assert codes == [1] * 4, texts
+    assert all(re.search(r"could not be written to .*: host 3: .*File too large.* Is the disk full", text)
+               for text in texts), texts
+    assert not list((folder / "checkpoints").glob("*orbax*"))
+
+    codes, texts = ended(start(folder, "--resume", hosts=2))
+    assert codes == [0, 0], texts
     assert_close(logged(folder), alone)

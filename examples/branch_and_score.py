@@ -14,7 +14,7 @@ from muvo_jax.agents import environment
 STEPS = 6
 
 
-def main(folder: str) -> None:
+def main(folder: str = "builtin:town") -> None:
     run = muvo_jax.load(folder)
     batch = muvo_jax.windows(run, "train", count=8)
     observed = muvo_jax.observe(run.model, run.variables, jax.random.key(0), batch)
@@ -35,4 +35,4 @@ def main(folder: str) -> None:
 
 
 if __name__ == "__main__":
-    main(sys.argv[1])
+    main(*sys.argv[1:])

@@ -14,7 +14,7 @@ import optax
 import muvo_jax
 
 
-def main(folder: str) -> None:
+def main(folder: str = "builtin:town") -> None:
     run = muvo_jax.load(folder)
     model, variables = run.model, run.variables
     batch = muvo_jax.windows(run, "train", count=8)
@@ -44,4 +44,4 @@ def main(folder: str) -> None:
 
 
 if __name__ == "__main__":
-    main(sys.argv[1])
+    main(*sys.argv[1:])

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import muvo_jax
 
 
-def main(folder: str) -> None:
+def main(folder: str = "builtin:town") -> None:
     run = muvo_jax.load(folder)
     model, variables = run.model, run.variables
     batch = muvo_jax.windows(run, count=2)
@@ -30,4 +30,4 @@ def main(folder: str) -> None:
 
 
 if __name__ == "__main__":
-    main(sys.argv[1])
+    main(*sys.argv[1:])

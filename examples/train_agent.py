@@ -12,7 +12,7 @@ import muvo_jax
 from muvo_jax.agents import actor_critic, policy_file
 
 
-def main(folder: str, out: str = "", updates: str = "20") -> None:
+def main(folder: str = "builtin:town", out: str = "", updates: str = "20") -> None:
     run = muvo_jax.load(folder)
     batch = muvo_jax.windows(run, "train", count=8)
     observed = muvo_jax.observe(run.model, run.variables, jax.random.key(0), batch)

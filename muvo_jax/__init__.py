@@ -86,6 +86,7 @@ def windows(run, split=None, *, count=2, frames=None):
     Raises:
       muvo_jax.training.checkpoint.CheckpointError: if the folder holds no readable checkpoint.
       muvo_jax.data.schema.DataError: if the recording is gone, lacks the split, or has fewer windows of that length.
+      ValueError: for a count or frames below 1.
     """
     from muvo_jax.training import validation  # imported late, as above
 

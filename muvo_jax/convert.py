@@ -64,8 +64,8 @@ def convert(options: Options, show: screen.Screen) -> checkpoints.Stored:
         raise checkpoints.CheckpointMismatch(
             f"{options.checkpoint}: expected the keys of {described}, to judge by its shapes; found {problems}.")
     show.line(f"{options.checkpoint.name}: {described}" + (f"; the released {what}" if what else ""))
-    config = dataclasses.replace(presets.get("paper-occupancy" if "occupancy" in model.heads else "paper"), model=model)
-    config = config_lib.override(config, "data.town_size", "tiny")
+    preset = presets.get("paper-occupancy" if "occupancy" in model.heads else "paper")
+    config = stored.config or config_lib.override(dataclasses.replace(preset, model=model), "data.town_size", "tiny")
     step = stored.facts.get("global_step", 0)
     step = step if type(step) is int and 0 <= step < 2**63 else 0
     ignored = dict(stored.beside) | match.ignored
@@ -93,9 +93,8 @@ def _write(out: pathlib.Path, step: int, variables: Any, config: config_lib.Conf
         with contextlib.suppress(OSError):
             for parent in absent:
                 parent.rmdir()
-        reason = (str(error).strip().splitlines() or ["no details"])[0]
-        raise OSError(f"the run could not be written to {out}: {type(error).__name__}: {reason}. Is the disk full? "
-                      f"Nothing was left behind.") from error
+        raise OSError(f"the run could not be written to {out}: {screen.said(error)}. Is the disk full? Nothing was "
+                      f"left behind.") from error
 
 
 def _write_whole(out: pathlib.Path, step: int, variables: Any, config: config_lib.Config,

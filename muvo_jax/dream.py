@@ -73,8 +73,13 @@ python -m muvo_jax.dream builtin:town --rerun=dream.rrd && rerun dream.rrd
 
 
 def dream(options: Options, show: screen.Screen) -> list[pathlib.Path]:
-    """Does what the command line asks for; returns the files written."""
+    """Does what the command line asks for; returns the files written.
+
+    Raises:
+      ValueError: for a run whose heads show nothing, before any data is opened; for options that do not fit.
+    """
     loaded = command_line.load_run(options.run, options.checkpoint, show)
+    evaluate.check_shown(loaded, "a dream")
     if options.rerun:
         rerun_log.check(options.rerun)
     for flag, value in (("branches", options.branches), ("moments", options.moments)):
@@ -131,6 +136,9 @@ def choose_window(recording: schema.Recording, config: config_lib.Config, option
                          f"{', '.join(description.splits)}.")
     needs = prepare_lib.needed(config, description.modalities)
     sequences = [sequence for sequence in recording.sequences if sequence.split == split and sequence.has(needs)]
+    if not sequences:
+        raise ValueError(f"split {split!r} of {description.name!r} has no sequence with {', '.join(sorted(needs))}, "
+                         f"which this model needs.")
     named = [sequence for sequence in sequences if options.sequence in (None, sequence.name)]
     if not named:
         known = ", ".join(sorted({sequence.name for sequence in sequences})[:12])

@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import hashlib
 import pathlib
+import re
 import sys
+import warnings
 from collections.abc import Mapping
 from typing import Annotated, Any
 
@@ -18,6 +21,8 @@ with late.imports():
 
     from muvo_jax import config as config_lib
     from muvo_jax import evaluation_report
+    from muvo_jax import head as head_lib
+    from muvo_jax import run as run_lib
     from muvo_jax.agents import forecasts
     from muvo_jax.data import fitting, pipeline, schema, windows
     from muvo_jax.metrics import baselines, cards, protocol, warp
@@ -84,6 +89,8 @@ def evaluate(options: Options, show: screen.Screen) -> dict[str, Any]:
               "chamfer_points": "evaluation.chamfer_points", "sampled": "evaluation.sampled"}
     if options.uncertainty < 0 or options.uncertainty == 1:
         raise ValueError(f"--uncertainty is {options.uncertainty}; expected two futures or more, or 0 for none.")
+    if options.rerun:
+        check_shown(loaded, "--rerun")
     log = rerun_log.RerunLog(options.rerun) if options.rerun else None
     chosen = command_line.chosen_settings(options, fields)
     config = config_lib.override_all(loaded.config, chosen)
@@ -98,6 +105,7 @@ def evaluate(options: Options, show: screen.Screen) -> dict[str, Any]:
     report: dict[str, Any] = {
         "run": str(loaded.folder), "variant": config.model.variant, "step": loaded.step,
         "parameters": sum(leaf.size for leaf in jax.tree.leaves(loaded.variables["params"])),
+        "trained_on": (loaded.provenance or {}).get("name"),
         "data": {"name": recording.description.name, "path": config.data.path}, "protocol": protocol.identity(config),
         "card": {"name": card.name, "about": card.about, "notes": card.notes} if card else None,
         "training_mean_frames": mean_frames, "packages": checkpoint_meta.package_versions(), "splits": {}}
@@ -122,7 +130,7 @@ def evaluate(options: Options, show: screen.Screen) -> dict[str, Any]:
             show.console.print(evaluation_report.screen_table(split, phase, scores))
         show.line(evaluation_report.answers_line(scores["action_shuffle"]))
     suffix = f"-{pathlib.Path(card.name).stem}" if card else ""
-    suffix += f"-{recording.description.name}" if options.data else ""
+    suffix += f"-{_in_a_name(recording.description.name)}" if options.data else ""
     written = evaluation_report.write_report(loaded.folder, report, suffix)
     if options.uncertainty:
         written += (evaluation_report.draw_uncertainty(loaded.folder / f"uncertainty{suffix}.png", report),)
@@ -130,6 +138,14 @@ def evaluate(options: Options, show: screen.Screen) -> dict[str, Any]:
     for path in written:
         show.line(f"wrote {path}")
     return report
+
+
+def check_shown(loaded: run_lib.Run, what: str) -> None:
+    """Raises ValueError where none of a run's heads predicts what `what` could show."""
+    if not protocol.shown_heads(loaded.config.model):
+        raise ValueError(f"run {loaded.folder} has the heads {', '.join(loaded.config.model.heads)}, and none of them "
+                         f"predicts what could be drawn; {what} needs one or more of {', '.join(head_lib.shown())}. "
+                         f"Train with one of these (--with-heads=image), which --init can start from this run.")
 
 
 def log_windows(log: rerun_log.RerunLog, config: config_lib.Config, split: str, item: protocol.Windows,
@@ -144,6 +160,14 @@ def log_windows(log: rerun_log.RerunLog, config: config_lib.Config, split: str, 
         sources[evaluation_report.SOURCES[source]] = before + sheets.views_of_frames(ahead, 0)
     log.window(item.batch, sources, sheets.Scene.of(config), context=context,
                poses=warp.path(item.batch, context, config), name=split)
+
+
+def _in_a_name(text: str) -> str:
+    """A recording's name as a part of a file's: KITTI's are those of all its drives, other ones have slashes."""
+    plain = re.sub(r"[^\w.-]+", "-", text)
+    if plain == text and len(text) <= 60:
+        return text
+    return f"{plain[:40]}-{hashlib.sha256(text.encode()).hexdigest()[:8]}"
 
 
 def _splits(card: cards.Card | None, recording: schema.Recording) -> tuple[str, ...]:
@@ -177,12 +201,19 @@ def _named(scores: dict[str, Any], card: cards.Card | None, frames: pipeline.Fra
 def fit(config: config_lib.Config, recording: schema.Recording, chosen: tuple[str, ...],
         splits: tuple[str, ...] | None = None) -> config_lib.Config:
     """The config fitted to a recording, whose sensors must be those that the model was trained with; windows need to
-    fit into these splits alone (None: all).
+    fit into these splits alone (None: all). Warns where the recording is so short that they are cut in another way.
 
     Raises:
       ValueError: naming both where the recording asks for another network.
     """
     fitted = fitting.adapt(config, recording, keep=(*chosen, *fitting.OF_TRAINED), splits=splits).config
+    changed = ", ".join(f"{name}={getattr(fitted.data, name)} ({getattr(config.data, name)})"
+                        for name in ("stride", "context", "horizon")
+                        if getattr(fitted.data, name) != getattr(config.data, name))
+    if changed:
+        warnings.warn(f"recording {recording.description.name!r} is too short for the windows of this run; it is "
+                      f"judged with {changed}, in brackets what it was trained with. --context and --horizon choose "
+                      f"others.", schema.DataWarning, stacklevel=2)
     where = f"recording {recording.description.name!r} asks for another model than this run, which"
     checkpoint_meta.check_architecture(fitted, config, where)
     return fitted

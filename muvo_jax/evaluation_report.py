@@ -125,11 +125,18 @@ def json_ready(value):
     return str(value) if isinstance(value, float) and not math.isfinite(value) else value
 
 
+def _on(report: Mapping[str, Any]) -> str:
+    trained, judged = report.get("trained_on"), report["data"]["name"]
+    if trained is None:
+        return f"judged on {judged}"
+    return f"trained and judged on {judged}" if trained == judged else f"trained on {trained}, judged on {judged}"
+
+
 def markdown(report: Mapping[str, Any]) -> str:
     """The report as a page: for each split the averages and every step of the horizon."""
     lines = [f"# {pathlib.Path(report['run']).name}", "",
-             f"{report['variant']}, {report['parameters']:,} parameters, step {report['step']}, trained and judged on "
-             f"{report['data']['name']}.", "", f"Protocol: {report['protocol']}. Training mean of "
+             f"{report['variant']}, {report['parameters']:,} parameters, step {report['step']}, "
+             f"{_on(report)}.", "", f"Protocol: {report['protocol']}. Training mean of "
              f"{report['training_mean_frames']} frames. Bold is best. Chamfer and PSNR are means over frames; voxel "
              f"scores and movers' PSNR come from sums over the whole split. In brackets 95 % intervals by bootstrap "
              f"over drives. Above the road: {occupancy.ABOVE_ROAD_M:g} m and more over the ground under the ego.", ""]
@@ -142,9 +149,12 @@ def markdown(report: Mapping[str, Any]) -> str:
                   f"Samples {samples['fingerprint']}.", ""]
         for phase in judged_phases(scores):
             lines += [f"### {phase} frames", "", *_average_table(scores[phase]), ""]
-        lines += ["### imagined frames, step by step", "", *_step_table(scores["imagined"]), "",
-                  "### answer to actions", "", *_answer_table(scores["action_shuffle"]), "",
-                  f"Movers: {scores['movers'] or 'none'}. Copy-last copied {scores['copy_last_unknown_voxels']} "
+        if "imagined" in judged_phases(scores):
+            lines += ["### imagined frames, step by step", "", *_step_table(scores["imagined"]), "",
+                      "### answer to actions", "", *_answer_table(scores["action_shuffle"]), ""]
+        else:
+            lines += ["Nothing that the heads predict is scored.", ""]
+        lines += [f"Movers: {scores['movers'] or 'none'}. Copy-last copied {scores['copy_last_unknown_voxels']} "
                   f"unknown voxels as empty.", ""]
         if "uncertainty" in scores:
             lines += ["### sampled futures", "", *uncertainty_table(scores["uncertainty"]), ""]
@@ -196,10 +206,11 @@ def _answer_table(ratios: Mapping[str, Any]) -> list[str]:
 def uncertainty_table(found: Mapping[str, Any]) -> list[str]:
     """What forecasts.measure returns, as Markdown."""
     steps = len(found["per_step"]["trust"])
+    far = (f"at least a half for {words.counted(found['trust_horizon'], 'step')}"
+           if math.isfinite(found["trust_horizon"]) else "which a single window does not tell")
     lines = [f"{words.counted(found['branches'], 'future')} of each of {words.counted(found['windows'], 'window')}. "
-             f"Trust: 1 - variance among the futures of a window / variance of all; at least a half for "
-             f"{words.counted(found['trust_horizon'], 'step')}. CRPS equals the error of one future where all agree.",
-             "",
+             f"Trust: 1 - variance among the futures of a window / variance of all, {far}. CRPS equals the error of "
+             f"one future where all agree.", "",
              "| score | " + " | ".join(str(step + 1) for step in range(steps)) + " |", "|---|" + "---:|" * steps]
     for name, values in found["per_step"].items():
         label, unit, decimals = forecasts.SCORES[name]

@@ -106,9 +106,9 @@ def seal(model: world_model.WorldModel, variables: types.Variables, config: conf
     contents[SIGNATURES] = json.dumps({"platforms": PLATFORMS, "horizon": horizon, "functions": signatures,
                                        "first_argument": "all arrays of weights.safetensors, a flat dictionary"},
                                       indent=2).encode()
-    for name, content in contents.items():
-        (out / name).write_bytes(content)
     safetensors_file.save(out / WEIGHTS, weights)
+    for name, content in contents.items():  # SIGNATURES last: an artefact without it is not whole
+        (out / name).write_bytes(content)
     return [*(out / name for name in contents), out / WEIGHTS]
 
 

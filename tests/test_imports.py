@@ -39,7 +39,7 @@ ALLOWED = {
 }
 # Inside data: what every format shares, the formats, what finds them, and what makes batches of any of them.
 RECORDED = {"errors", "fields", "words", "schema", "sequences", "files", "description", "runs", "ego_motion",
-            "processes"}
+            "processes", "fingerprints"}
 ALLOWED_IN_DATA = dict.fromkeys(RECORDED, RECORDED) | {
     "plain": RECORDED,
     "kitti": RECORDED,

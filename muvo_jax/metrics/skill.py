@@ -14,6 +14,7 @@ from typing import Any
 
 from muvo_jax import head as head_lib
 
+_NOTHING = -1.0  # of a head that predicts nothing to be measured, such as no return at all: as bad as twice the error
 REFERENCES = ("warp_last", "copy_last")  # the first that was judged
 STATED = ("mean over the validation splits of 1 - error / error of the moved last frame, over image, points and voxels "
           "above the road, of imagined frames")
@@ -34,6 +35,7 @@ def skill(imagined: Mapping[str, Mapping[str, Any]]) -> float:
             continue
         pair = [imagined[source].get(name, {}).get("mean", math.nan) for source in ("model", reference)]
         ours, theirs = map(metric.error, pair)
-        if math.isfinite(ours) and math.isfinite(theirs) and theirs > 0.0:
-            found.append(1.0 - ours / theirs)
+        if not (math.isfinite(theirs) and theirs > 0.0 and name in imagined["model"]):
+            continue
+        found.append(1.0 - ours / theirs if math.isfinite(ours) else _NOTHING)
     return sum(found) / len(found) if found else math.nan

@@ -73,7 +73,14 @@ def views_of_batch(batch: types.Batch, sample: int) -> list[View]:
 
 
 def views_of_frames(frames: Mapping[str, np.ndarray], sample: int | tuple[int, ...]) -> list[View]:
-    """The decoded frames of one window: {head: [B, T, ...]}, flags as 0 and 1; `sample` may index more axes."""
+    """The decoded frames of one window: {head: [B, T, ...]}, flags as 0 and 1; `sample` may index more axes.
+
+    Raises:
+      ValueError: where no head decodes any.
+    """
+    if not frames:
+        raise ValueError(f"there is nothing to draw: none of the model's heads is one of "
+                         f"{', '.join(head_lib.shown())}. Train with one of these (--with-heads=image).")
     chosen = {name: np.asarray(value[sample]) for name, value in frames.items()}
     chosen = {name: value.astype(np.uint8) if value.dtype == np.bool_ else value for name, value in chosen.items()}
     count = next(iter(chosen.values())).shape[0]
@@ -180,7 +187,8 @@ def write_dream(folder: str | os.PathLike, truth: Sequence[View], predictions: M
                                 scene, badge=moment.badge, caption=f"{moment.time_s:+.1f} s   {title}",
                                 action=moment.action) for frame, moment in enumerate(moments)]
         written.append(canvas.save_gif(folder / f"{name}.gif", pictures, max(scene.frame_s, 0.3)))
-    chosen = np.unique(np.linspace(0, len(truth) - 1, min(most_moments, len(truth))).round().astype(int))
+    # From the last one on: of a single moment that is the one.
+    chosen = np.unique(np.linspace(len(truth) - 1, 0, min(most_moments, len(truth))).round().astype(int))
     picked = [moments[frame] for frame in chosen]
     for suffix, page in (("sensors", sensor_sheet(picked, scene, title=title)),
                          ("space", space_sheet(picked, scene, title=title))):

@@ -20,8 +20,11 @@ def test_worked_arithmetic():
     assert skill.skill({"model": model, "copy_last": worst}) > 0.5
 
 
-def test_what_is_undefined_or_not_predicted_does_not_count():
-    model = {"psnr_db": {"mean": 20.0}, "chamfer_m": {"mean": math.nan}}
+def test_what_is_not_predicted_does_not_count_and_what_predicts_nothing_counts_as_bad():
+    model = {"psnr_db": {"mean": 20.0}}
     assert skill.skill({"model": model, "copy_last": scores(10.0, 1.0, 0.5)}) == pytest.approx(0.9)
+    blind = model | {"chamfer_m": {"mean": math.nan}}  # not a single return
+    assert skill.skill({"model": blind, "copy_last": scores(10.0, 1.0, 0.5)}) == pytest.approx((0.9 - 1.0) / 2)
+    assert skill.skill({"model": blind, "copy_last": scores(10.0, math.nan, 0.5)}) == pytest.approx(0.9)
     assert math.isnan(skill.skill({"model": model}))
     assert math.isnan(skill.skill({"model": {}, "copy_last": scores(10.0, 1.0, 0.5)}))

@@ -143,6 +143,15 @@ def test_a_baseline_stands_beside_the_dream_on_every_sheet(tmp_path):
     assert taller_space[1] > space[1] and taller_space[0] == space[0]
 
 
+def test_of_one_moment_the_last_is_shown(tmp_path, monkeypatch):
+    shown = []
+    monkeypatch.setattr(sheets, "sensor_sheet", lambda moments, *_, **__: shown.extend(moments))
+    views = [_view(seed) for seed in range(4)]
+    sheets.write_dream(tmp_path, views, {"world model": views}, np.zeros((4, 2)), SCENE, context=2, title="t",
+                       most_moments=1, animate=False)
+    assert [moment.badge for moment in shown] == ["imagined"] and shown[0].truth is views[3]
+
+
 def test_a_recording_with_a_camera_alone_has_no_space_sheet(tmp_path):
     views = [sheets.View(image=_view()["image"])] * 2
     paths = sheets.write_dream(tmp_path, views, {"world model": views}, np.zeros((2, 2)), SCENE, context=1, title="t")

@@ -74,6 +74,10 @@ def _results(options: Options, study: tables.Study, folder: pathlib.Path, planne
     runs: dict[str, dict[str, Any]] = {}
     for job in planned:
         runs.setdefault(job.label, {})[str(job.seed)] = queue.read(folder, job, study) or _recorded(existing, job)
+    for label, seeds in (existing or {}).get("runs", {}).items():  # of other seeds, or with memory, asked for or not
+        for seed, found in seeds.items():
+            if found and "died" not in found and not runs.setdefault(label, {}).get(seed):
+                runs[label][seed] = found
     _check_one_card([run for seeds in runs.values() for run in seeds.values() if run and "died" not in run], folder)
     kept = {name: existing[name] for name in ("command", "commit", "machine")} if existing else {}
     words = shlex.join(["python", "-m", "experiments.run", *sys.argv[1:]])
@@ -148,9 +152,9 @@ def run(options: Options, show: screen.Screen) -> None:
         return results
 
     def make(jobs: list[queue.Job]) -> None:
-        started_from = {(job.arm.after, job.seed) for job in jobs if job.arm.after and not _recorded(existing, job)}
+        started_from = {job.after for job in jobs if job.arm.after and not _recorded(existing, job)}
         for index, job in enumerate(mine := queue.of_shard(jobs, *shard)):
-            recorded = _recorded(existing, job) and (job.arm.name, job.seed) not in started_from
+            recorded = _recorded(existing, job) and job.name not in started_from
             if not (options.only_report or recorded or (folder / job.name / queue.EVALUATION).is_file()):
                 show.line(f"run {index + 1} of {len(mine)}:")
                 queue.make(study, scale, job, folder, show.line, extra)

@@ -7,6 +7,7 @@ times anew; then the town judges it. Without one it shows that brax runs through
 """
 
 import argparse
+import functools
 
 import jax
 import jax.numpy as jnp
@@ -21,28 +22,35 @@ if not hasattr(jax, "device_put_replicated"):
 
 
 def train(env, steps, seed=0, restore=None, **options):
-    """Brax's PPO; (make_policy, params, metrics) of brax."""
-    return ppo.train(
+    """Brax's PPO; its make_policy and params, and how many steps it took: whole rounds of batches, at least `steps`."""
+    taken = []
+
+    def tell(step, metrics):
+        taken.append(step)
+        print(f"{step:7d} steps: return of an episode {metrics['eval/episode_reward']:.3f} "
+              f"(length {metrics['eval/avg_episode_length']:.1f})", flush=True)
+
+    make_policy, params, _ = ppo.train(
         environment=env, num_timesteps=steps, episode_length=env.episode_length, num_minibatches=4,
         num_updates_per_batch=4, num_evals=3, num_eval_envs=64, learning_rate=1e-3, entropy_cost=1e-3, discounting=0.97,
-        normalize_observations=True, seed=seed, restore_params=restore, progress_fn=lambda step, metrics: print(
-            f"{step:7d} steps: return of an episode {metrics['eval/episode_reward']:.3f} "
-            f"(length {metrics['eval/avg_episode_length']:.1f})", flush=True), **options)
+        normalize_observations=True, seed=seed, restore_params=restore, progress_fn=tell, **options)
+    return make_policy, params, taken[-1]
 
 
 def learn_to_drive(options):
     """Rounds of imagining futures under the policy and learning in them; then the policy drives in the town."""
-    dreams, restore, policy = worlds.Dreams(options.run), None, jax.tree_util.Partial(noisy_coasting)
+    dreams, restore, taken, policy = worlds.Dreams(options.run), None, 0, jax.tree_util.Partial(noisy_coasting)
     for index in range(options.rounds + 1):
         imagined = dreams.futures(jax.random.fold_in(jax.random.key(0), index), policy)
-        print(worlds.told(index, imagined, index * options.steps // options.rounds), flush=True)
+        print(worlds.told(index, imagined, taken), flush=True)
         if index < options.rounds:
             env = brax_env.BraxImagination(dreams.core, dreams.core.params(imagined))
-            make_policy, restore, _ = train(
+            make_policy, restore, more = train(
                 env, options.steps // options.rounds, seed=index, restore=restore, num_envs=512, batch_size=512,
                 unroll_length=12, reward_scaling=0.1, num_resets_per_eval=10)
-            policy = jax.tree_util.Partial(act, make_policy(restore, deterministic=False))
-    policy = jax.tree_util.Partial(act, make_policy(restore, deterministic=True))
+            taken += more
+            policy = jax.tree_util.Partial(functools.partial(act, make_policy, False), restore)
+    policy = jax.tree_util.Partial(functools.partial(act, make_policy, True), restore)
     print(dreams.judge(policy, options.drives), flush=True)
 
 
@@ -50,8 +58,9 @@ def noisy_coasting(key, observation):
     return jnp.tanh(0.5 * jax.random.normal(key, (2,)))
 
 
-def act(inference, key, observation):
-    return jnp.clip(inference(observation, key)[0], -1.0, 1.0)
+def act(make_policy, deterministic, learned, key, observation):
+    """What jax.tree_util.Partial holds as arrays is the learned alone: brax's functions are no pytrees."""
+    return jnp.clip(make_policy(learned, deterministic=deterministic)(observation, key)[0], -1.0, 1.0)
 
 
 def main():

@@ -41,17 +41,19 @@ def main():
     for name, driver in drivers.items():
         @jax.jit
         def drive(key, driver=driver):
-            _, state = jax.vmap(core.reset, (0, None))(jax.random.split(key, options.cars), params)
+            key_reset, key_steps = jax.random.split(key)
+            _, state = jax.vmap(core.reset, (0, None))(jax.random.split(key_reset, options.cars), params)
 
             def step(carry, key):
                 state, alive = carry
-                action = driver(key, state)
-                state, transition = jax.vmap(core.step, (0, 0, 0, None))(jax.random.split(key, options.cars), state,
-                                                                         action, params)
+                key_driver, key_step = jax.random.split(key)
+                action = driver(key_driver, state)
+                keys = jax.random.split(key_step, options.cars)
+                state, transition = jax.vmap(core.step, (0, 0, 0, None))(keys, state, action, params)
                 return (state, alive & ~transition.terminated), alive * transition.reward
 
             first = (state, jnp.ones(options.cars, bool))
-            return jax.lax.scan(step, first, jax.random.split(key, options.horizon))[1].sum(axis=0).mean()
+            return jax.lax.scan(step, first, jax.random.split(key_steps, options.horizon))[1].sum(axis=0).mean()
 
         print(f"{name:22s} imagined return {drive(jax.random.key(0)):.3f}", flush=True)
 

@@ -38,7 +38,7 @@ def best_shifts(frames: np.ndarray, truth: np.ndarray) -> np.ndarray:
     return np.take_along_axis(candidates, error.argmin(axis=0)[None, ..., None], axis=0)[0]
 
 
-def main(path: str, windows: str = "16") -> None:
+def main(path: str = "builtin:town", windows: str = "16") -> None:
     run = muvo_jax.load(path)
     config, context, horizon = run.config, run.config.data.context, run.config.data.horizon
     recording = recordings.open_configured(config)

@@ -47,7 +47,7 @@ def kinds(truth, image, inside):
             "seen, flat": inside & ~movers & ~near}
 
 
-def main(path: str, windows: str = "16") -> None:
+def main(path: str = "builtin:town", windows: str = "16") -> None:
     run = muvo_jax.load(path)
     config, context, horizon = run.config, run.config.data.context, run.config.data.horizon
     recording = recordings.open_configured(config)

@@ -83,7 +83,7 @@ def images(run, batch: Batch) -> dict[str, jax.Array]:
     return {name: jnp.where(inside, edge, fill) for name, fill in fills.items()}
 
 
-def main(path: str) -> None:
+def main(path: str = "builtin:town") -> None:
     run = muvo_jax.load(path)
     config = run.config
     recording = recordings.open_configured(config)
@@ -116,4 +116,4 @@ def main(path: str) -> None:
 
 
 if __name__ == "__main__":
-    main(sys.argv[1])
+    main(*sys.argv[1:])

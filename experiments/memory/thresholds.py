@@ -16,7 +16,7 @@ from muvo_jax.metrics import occupancy
 ABOVE = (0.2, 0.25, 0.3, 0.35, 0.4, 0.45, 0.5)
 
 
-def main(path: str) -> None:
+def main(path: str = "builtin:town") -> None:
     run = muvo_jax.load(path)
     config, model = run.config, run.model
     context, horizon = config.data.context, config.data.horizon
@@ -49,4 +49,4 @@ def main(path: str) -> None:
 
 
 if __name__ == "__main__":
-    main(sys.argv[1])
+    main(*sys.argv[1:])

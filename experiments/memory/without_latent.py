@@ -3,7 +3,7 @@
     python -m experiments.memory.without_latent --fusion=tr --name=without-latent
 
 takes the flags of muvo_jax.train. The other rows of docs/memory.md are made by that command itself: the latent alone by
-`--set model.first_guess=training_mean --steps=300`, both by the default.
+`--set model.first_guess=training_mean --steps=460`, both by the default.
 """
 
 import sys

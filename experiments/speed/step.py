@@ -22,7 +22,7 @@ from muvo_jax.model import glimpse, rollout, world_model
 from muvo_jax.model import memory as memory_lib
 from muvo_jax.objectives import kl, total
 from muvo_jax.ops import camera, range_view
-from muvo_jax.training import cost, optimizer, state, step
+from muvo_jax.training import cost, host, optimizer, state, step
 from muvo_jax.types import Batch
 
 
@@ -60,24 +60,26 @@ def parts(config: config_lib.Config, batch: Batch) -> dict[str, tuple]:
         join(own), *inputs, method=method, mutable=["batch_stats"])[0]
     camera_of = lambda own: during(own, lambda module, frames: module.camera(frames, mode), frames)
     lidar_of = lambda own: during(own, lambda module, frames: module.lidar(frames, mode), frames)
-    maps = jax.jit(lambda: (camera_of({}), lidar_of({})))()
+    # What follows is computed of arguments: XLA would fold constants, for minutes at the paper's size.
+    maps = jax.jit(lambda own: (camera_of(own), lidar_of(own)))(params)
     measured = lambda module: [module.route(frames["route_map"], mode)] + (
         [module.speed(frames["speed_mps"])] if config.model.speed else [])
     fused = lambda own, maps: during(own, lambda module, maps: module.fusion(*maps, measured(module), mode, None), maps)
-    embedding = jax.jit(fused)({}, maps)
+    embedding = jax.jit(fused)(params, maps)
     embedding = embedding.reshape(*shown.action.shape[:2], *embedding.shape[1:])
     noise = rollout.draw_noise(keys, seen, model.initial_state(1).stochastic.shape[1:], dropout=True)
     filtered = lambda own, embedding: rollout.filter_embeddings(
         model, join(own), embedding, shown.action, shown.is_first, noise,
         jnp.asarray(shown.speed_mps) if config.model.tracks_motion else None)
-    observed, _ = jax.jit(lambda: rollout.observe_window(model, variables, shown, keys, train=True))()
+    observed, _ = jax.jit(
+        lambda variables: rollout.observe_window(model, variables, shown, keys, train=True))(variables)
     rows = {"camera encoder": (camera_of, (of("camera"),), ()), "lidar encoder": (lidar_of, (of("lidar"),), ()),
             "route, speed and fusion": (fused, (of("fusion", "route", "speed"), maps), ()),
             "filter": (filtered, (of("transition"), embedding), ())}
     if seen < batch.frames:
         rows["imagining"] = (lambda own, last: rollout.imagine(model, join(own), keys, last, jnp.asarray(
             batch.action)[:, seen - 1:-1]).states.features, (of("transition"), observed.last), ())
-    states = jax.jit(lambda: step._and_imagined(model, variables, observed, batch.action, keys))()
+    states = jax.jit(lambda variables: step._and_imagined(model, variables, observed, batch.action, keys))(variables)
     states, target = step._some_frames(states, batch, keys, config.train.decode_frames)
     flat = lambda tree: jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), tree)
     frame_keys = total.frame_keys(keys, target.frames)
@@ -126,7 +128,7 @@ def profile(config: config_lib.Config, rounds: int, rate: float) -> None:
         row(name, min(taken["forward"]), min(taken["whole"]), arithmetic, rate)
     update, train, arguments = updates(config, batch)
     arithmetic = cost.operations(jax.make_jaxpr(train.compiled)(*arguments).jaxpr)
-    row("**whole step**", float("nan"), min(timing.processor_seconds({"whole": update}, rounds)["whole"]), arithmetic,
+    row("**whole step**", None, min(timing.processor_seconds({"whole": update}, rounds)["whole"]), arithmetic,
         rate)
 
 
@@ -145,9 +147,10 @@ def updates(config: config_lib.Config, batch: Batch):
     return update, train, shapes
 
 
-def row(name: str, forward_s: float, whole_s: float, arithmetic: float, rate: float) -> None:
-    print(f"| {name} | {forward_s:.3f} | {whole_s:.3f} | {arithmetic / 1e9:.1f} | {arithmetic / whole_s / rate:.0%} |",
-          flush=True)
+def row(name: str, forward_s: float | None, whole_s: float, arithmetic: float, rate: float) -> None:
+    forward = "" if forward_s is None else f"{forward_s:.3f}"
+    share = arithmetic / whole_s / rate
+    print(f"| {name} | {forward} | {whole_s:.3f} | {arithmetic / 1e9:.1f} | {share:.0%} |", flush=True)
 
 
 def main():
@@ -156,6 +159,7 @@ def main():
     parser.add_argument("--set", nargs="*", default=[], metavar="KEY=VALUE")
     parser.add_argument("--rounds", type=int, default=3)
     options = parser.parse_args()
+    host.restart_with_huge_pages()  # as `train` does
     chosen = dict(setting.split("=", 1) for setting in options.set)
     config = config_lib.override_all(presets.get(options.preset), {
         name: json.loads(value) if value[:1] in "0123456789tf[" else value for name, value in chosen.items()})

@@ -1,4 +1,5 @@
 """The whole table of speed and memory: python experiments/speed/table.py [--sizes town paper] [--latents 1d 2d]
+[--sections remat use parts growth imagination data] [--remats none heads frames]
 
 For each size and latent: the parts of a training step; its memory, arithmetic and compilation under each train.remat;
 encoding, an imagined step of the latent alone and with all heads. Then how the step and imagination grow, and the data
@@ -11,6 +12,7 @@ import argparse
 import dataclasses
 import functools
 import time
+from collections.abc import Sequence
 
 import data
 import imagine
@@ -23,10 +25,11 @@ import muvo_jax
 from muvo_jax import config as config_lib
 from muvo_jax import presets
 from muvo_jax.model import rollout
-from muvo_jax.training import cost, loop, preparation
+from muvo_jax.training import cost, host, loop, preparation
 
 SIZES = {"tiny": "tiny", "town": "town", "paper": "paper-occupancy"}
 REMATS = ("none", "heads", "frames")
+SECTIONS = ("remat", "use", "parts", "growth", "imagination", "data")
 
 
 def config_of(size: str, latent: str) -> config_lib.Config:
@@ -39,15 +42,18 @@ def of_step(config: config_lib.Config) -> cost.StepCost:
     return cost.of_step(config, preparation.expected_batch(config, loop.windows_per_step(config)))
 
 
-def memory(config: config_lib.Config) -> None:
-    """What the step takes under each policy, as XLA plans it."""
-    print("\n| train.remat | memory of the step (GiB) | arithmetic (GFLOP) | tracing and compiling (processor s) |")
-    print("|---|---:|---:|---:|")
-    for remat in REMATS:
+def memory(config: config_lib.Config, rounds: int, remats: Sequence[str]) -> None:
+    """What the step takes under each policy: memory as XLA plans it, time as measured."""
+    print("\n| train.remat | memory of the step (GiB) | arithmetic (GFLOP) | tracing and compiling (processor s) "
+          "| a step (processor s) |")
+    print("|---|---:|---:|---:|---:|")
+    for remat in remats:
         start_s = time.process_time()
-        found = of_step(config_lib.override(config, "train.remat", remat))
-        print(f"| {remat} | {found.total_bytes / 2**30:.2f} | {found.operations / 1e9:.0f} | "
-              f"{time.process_time() - start_s:.1f} |", flush=True)
+        changed = config_lib.override(config, "train.remat", remat)
+        found = of_step(changed)
+        compiling_s = time.process_time() - start_s
+        print(f"| {remat} | {found.total_bytes / 2**30:.2f} | {found.operations / 1e9:.0f} | {compiling_s:.1f} | "
+              f"{whole_step_s(changed, rounds):.2f} |", flush=True)
 
 
 def using(config: config_lib.Config, rounds: int, rate: float) -> None:
@@ -102,8 +108,11 @@ def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--sizes", nargs="+", default=["town", "paper"], choices=SIZES)
     parser.add_argument("--latents", nargs="+", default=["1d", "2d"], choices=["1d", "2d"])
+    parser.add_argument("--sections", nargs="+", default=SECTIONS, choices=SECTIONS)
+    parser.add_argument("--remats", nargs="+", default=REMATS, choices=REMATS)
     parser.add_argument("--rounds", type=int, default=3)
     options = parser.parse_args()
+    host.restart_with_huge_pages()  # as `train` does
     jax.config.update("jax_enable_compilation_cache", False)  # compiling is measured
     rate = cost.product_rate()
     print(f"float32 product of {cost.GEMM_SIDE}x{cost.GEMM_SIDE}: {rate / 1e9:.0f} GFLOP a processor second")
@@ -111,20 +120,28 @@ def main():
         for latent in options.latents:
             config = config_of(size, latent)
             print(f"\n## {size}, {latent}: {config.train.batch} windows of {config.data.frames} frames\n")
-            memory(config)
-            using(config, options.rounds, rate)
-            print()
-            step.profile(config, options.rounds, rate)
+            if "remat" in options.sections:
+                memory(config, options.rounds, options.remats)
+            if "use" in options.sections:
+                using(config, options.rounds, rate)
+            if "parts" in options.sections:
+                print()
+                step.profile(config, options.rounds, rate)
     small = config_of("town" if "town" in options.sizes else options.sizes[0], options.latents[0])
-    print(f"\n## How it grows ({small.preset}, {options.latents[0]})")
-    growth(small, options.rounds)
-    bare = muvo_jax.WorldModel(dataclasses.replace(
-        presets.get("paper-occupancy" if "paper" in options.sizes else small.preset).model,
-        latent=config_of(options.sizes[-1], "1d").model.latent, heads=("action",)))
-    print()
-    imagine.times(bare, argparse.Namespace(branches=256, horizon=15, rounds=options.rounds))
-    print("\n## Data\n\n| what | plain | here | ratio |\n|---|---|---|---|")
-    print(data.projection(), data.voxelisation(), sep="\n")
+    if "growth" in options.sections:
+        print(f"\n## How it grows ({small.preset}, {options.latents[0]})")
+        growth(small, options.rounds)
+    if "imagination" in options.sections:
+        print()
+        bare = muvo_jax.WorldModel(dataclasses.replace(
+            presets.get("paper-occupancy" if "paper" in options.sizes else small.preset).model,
+            latent=config_of(options.sizes[-1], "1d").model.latent, heads=("action",)))
+        imagine.times(bare, argparse.Namespace(branches=256, horizon=15, rounds=options.rounds))
+    if "data" in options.sections:
+        print("\n## Data\n\n| what | plain | here | ratio |\n|---|---|---|---|")
+        print(data.projection(), data.voxelisation(), sep="\n")
+    print(f"\nfloat32 product at the end: {cost.product_rate() / 1e9:.0f} GFLOP a processor second; another "
+          "number than at the start says that the machine was not steady")
 
 
 if __name__ == "__main__":

@@ -55,10 +55,12 @@ def pairs_needed(differences: np.ndarray, says: str, margin: float) -> int | Non
 def lead(run: Mapping[str, Any], split: str, metric: str) -> float:
     """How far a run is ahead of the training mean beyond the margin; infinite where that has no such score."""
     metric = tables.OF_WHAT_IS_LEARNED[metric]
-    baseline = run["baselines"].get("training_mean", {}).get(split, {}).get(metric)
-    if baseline is None:
+    baseline = value({"scores": run["baselines"].get("training_mean", {})}, split, metric)
+    if math.isnan(baseline):
         return math.inf
-    ahead = value(run, split, metric) - baseline["mean"]
+    ahead = value(run, split, metric) - baseline
+    if math.isnan(ahead):  # such as the distance of points where none is predicted
+        return -math.inf
     return (-ahead if metric in tables.LOWER_IS_BETTER else ahead) - tables.MARGINS[metric]
 
 
@@ -74,9 +76,27 @@ def updates_needed(runs: Sequence[Mapping[str, Any]], split: str, metric: str) -
         last = max(curve, default=0)
         if last // 2 in curve:
             gains.append(sign * (curve[last] - curve[last // 2]))
-    gain, missing = np.mean(gains or [0.0]), -np.mean([lead(run, split, metric) for run in runs])
+    leads = [ahead for ahead in (lead(run, split, metric) for run in runs) if math.isfinite(ahead)]
+    gain, missing = np.nanmean(gains or [0.0]), -np.mean(leads or [-math.inf])
     doublings = missing / gain if gain > 0.0 else math.inf
-    return None if doublings > 10.0 else int(round(runs[0]["steps"] * 2.0**doublings, -2))
+    return None if not doublings <= 10.0 else int(round(runs[0]["steps"] * 2.0**doublings, -2))
+
+
+def differences(claim: tables.Claim, runs: Mapping[str, Mapping[str, Any]], split: str, metric: str,
+                suffix: str = "") -> np.ndarray:
+    """[N], of pairs of runs under one seed, positive where the claim's first arm is better.
+
+    Where pairs share an arm, their mean is one difference for each seed: they scatter together, and an interval over
+    all of them would be too narrow.
+    """
+    score = lambda label, seed: value(runs.get(label + suffix, {}).get(seed), split, metric)
+    seeds = dict.fromkeys(seed for first, _ in claim.pairs for seed in runs.get(first + suffix, {}))
+    found = np.array([[score(first, seed) - score(second, seed) for first, second in claim.pairs] for seed in seeds])
+    arms = [label for pair in claim.pairs for label in pair]
+    if len(set(arms)) < len(arms):
+        found = found[np.isfinite(found).all(axis=-1)].mean(axis=-1) if len(found) else found
+    signed = found[np.isfinite(found)]
+    return -signed if metric in tables.LOWER_IS_BETTER else signed
 
 
 def of_claims(study: tables.Study, runs: Mapping[str, Mapping[str, Any]], suffix: str = "") -> list[dict[str, Any]]:
@@ -95,11 +115,7 @@ def of_claims(study: tables.Study, runs: Mapping[str, Mapping[str, Any]], suffix
     for claim in study.claims:
         for metric in claim.metrics:
             for split in claim.splits:
-                found = [value(runs.get(first + suffix, {}).get(seed), split, metric)
-                         - value(runs.get(second + suffix, {}).get(seed), split, metric)
-                         for first, second in claim.pairs for seed in runs.get(first + suffix, {})]
-                signed = np.array([item for item in found if not math.isnan(item)])
-                signed = -signed if metric in tables.LOWER_IS_BETTER else signed
+                signed = differences(claim, runs, split, metric, suffix)
                 mean, low, high = mean_and_interval(signed)
                 margin, said, updates = tables.MARGINS[metric], UNDECIDED, None
                 compared = [run for pair in claim.pairs for label in pair

@@ -22,9 +22,9 @@ def text(folder: pathlib.Path = FOLDER) -> str:
         if path.is_file():
             results = json.loads(path.read_text(encoding="utf-8"))
             runs = report.complete(results)
-            done = sum(len(seeds) for seeds in runs.values())
-            planned = len(study.planned("town")) * tables.SEEDS["town"]
-            parts.append(f"{done} of {planned} runs without memory and those with it; "
+            count = lambda runs, memory: sum(len(seeds) for label, seeds in runs.items() if ("+" in label) == memory)
+            parts.append(f"{count(runs, False)} of {count(results['runs'], False)} runs without memory, "
+                         f"{count(runs, True)} with it; "
                          f"[report]({study.name}/{report.REPORT}), commit {results['commit']}.")
         rows = [row for suffix in ("", "+memory") for row in (
             {**row, "claim": row["claim"] + (", with memory" if suffix else "")}

@@ -17,9 +17,8 @@ from experiments.studies import tables
 
 PACKAGE = pathlib.Path(muvo_jax.__file__).parent
 # What decides the numbers of a run; other code may change between two sittings.
-_NUMERIC = ("config", "heads", "metrics", "model", "nn", "objectives", "ops", "town", "types", "presets.py",
-            "training/step.py", "training/optimizer.py", "training/augmentation.py", "training/light.py",
-            "training/mirror.py", "training/first_guess.py")
+_NUMERIC = ("config", "data", "heads", "metrics", "model", "nn", "objectives", "ops", "town", "training", "types",
+            "evaluate.py", "geometry.py", "head.py", "presets.py", "recordings.py")
 EVALUATION, LOG, DIED, COST = "evaluation.json", "log.txt", "died.txt", "cost.json"
 ATTEMPTS = 2
 
@@ -104,6 +103,9 @@ def make(study: tables.Study, scale: str, job: Job, folder: pathlib.Path, say: C
     if (run / DIED).is_file():
         say(f"{job.name}: died {ATTEMPTS} times before, left out; {run / LOG} says why. "
             f"Remove {run / DIED} to try again.")
+        return False
+    if job.arm.after and (folder / job.after / DIED).is_file():
+        say(f"{job.name}: waits for {job.after}, which died.")
         return False
     for attempt in range(ATTEMPTS):
         resumed = any((run / "checkpoints").glob("[0-9]*"))

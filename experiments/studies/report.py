@@ -74,7 +74,7 @@ def _how(results: Mapping[str, Any]) -> str:
     return (f"`{results['command']}` at commit {results['commit']} (code {results['code']}), on {results['machine']}; "
             f"{len(runs)} runs, {hours:.1f} processor hours. Protocol: {judged}. An effect is the mean difference of "
             f"pairs of runs under one seed, positive where the claim's first arm is better, with Student's interval "
-            f"over the pairs.")
+            f"over the pairs, or over the seeds where a claim's pairs share an arm.")
 
 
 def _scores(study: tables.Study, runs: Mapping[str, Mapping[str, Any]], results, split: str) -> Table:
@@ -91,7 +91,7 @@ def _scores(study: tables.Study, runs: Mapping[str, Mapping[str, Any]], results,
         found = {}
         for run in (run for seeds in runs.values() for run in seeds.values()):  # one without occupancy judges none
             found |= run["baselines"].get(source, {}).get(split, {})
-        rows.append([title, "", *(f"{found[metric]['mean']:.3f}" if metric in found else ""
+        rows.append([title, "", *(f"{float(found[metric]['mean']):.3f}" if metric in found else ""
                                   for metric in study.metrics), "", "", "a baseline"])
     return head, rows
 

@@ -75,7 +75,7 @@ def run(options_type: type[_Options], work: Callable[[_Options, screen.Screen], 
     check_numbers(options)
     if trains and arguments is None:
         host.restart_with_huge_pages()
-    use_compilation_cache()
+    prepare_compiler()
     late.load()
     show = screen.Screen()
     with warnings.catch_warnings():
@@ -171,11 +171,12 @@ def check_numbers(options: Any) -> None:
             raise SystemExit(2)
 
 
-def use_compilation_cache() -> None:
-    """Keeps compiled programs in the user's cache folder, unless JAX_COMPILATION_CACHE_DIR says where.
+def prepare_compiler() -> None:
+    """Keeps compiled programs in the user's cache folder (or JAX_COMPILATION_CACHE_DIR) and chooses emitters.
 
-    For a JAX that is yet to be imported: it reads the variable once.
+    For a JAX that is yet to be imported: it reads the variables once.
     """
+    host.use_plain_emitters()
     os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(cache_folder() / "jax"))
 
 

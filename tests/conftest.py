@@ -1,7 +1,7 @@
 """Every test sees 8 virtual CPU devices and raises on implicit rank promotion.
 
 Compiling takes most of the suite's time, so XLA leaves most of its optimisations out; JAX_DISABLE_MOST_OPTIMIZATIONS=0
-tests the programs that users run (.ci/run does so for the slow tests).
+tests the programs that users run (.ci/run does so for the slow tests). The emitters are those that commands choose.
 """
 
 import os
@@ -13,6 +13,9 @@ os.environ["XLA_FLAGS"] = os.environ.get("XLA_FLAGS", "") + " --xla_force_host_p
 import jax
 import pytest
 
+from muvo_jax.training import host
+
+host.use_plain_emitters()
 jax.config.update("jax_numpy_rank_promotion", "raise")
 
 

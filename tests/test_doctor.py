@@ -22,7 +22,7 @@ def run(*arguments):
 
 @pytest.fixture(autouse=True)
 def no_compilation_cache(monkeypatch):
-    monkeypatch.setattr(command_line, "use_compilation_cache", lambda: None)
+    monkeypatch.setattr(command_line, "prepare_compiler", lambda: None)
 
 
 def test_problems_are_reported_with_pictures_and_exit_code(tmp_path, capsys):

@@ -11,7 +11,7 @@ def run(monkeypatch, error):
     def work(options, show):
         raise error
 
-    monkeypatch.setattr(command_line, "use_compilation_cache", lambda: None)
+    monkeypatch.setattr(command_line, "prepare_compiler", lambda: None)
     return command_line.run(train.Options, work, program="train", arguments=[])
 
 

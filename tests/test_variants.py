@@ -27,7 +27,7 @@ def town(tmp_path_factory):
     cache = tmp_path_factory.mktemp("cache")
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("XDG_CACHE_HOME", str(cache))
-        patch.setattr(command_line, "use_compilation_cache", lambda: None)
+        patch.setattr(command_line, "prepare_compiler", lambda: None)
         command_line.open_data(presets.tiny(), screen.Screen())
         yield cache
 

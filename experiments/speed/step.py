@@ -160,6 +160,7 @@ def main():
     parser.add_argument("--rounds", type=int, default=3)
     options = parser.parse_args()
     host.restart_with_huge_pages()  # as `train` does
+    host.use_plain_emitters()
     chosen = dict(setting.split("=", 1) for setting in options.set)
     config = config_lib.override_all(presets.get(options.preset), {
         name: json.loads(value) if value[:1] in "0123456789tf[" else value for name, value in chosen.items()})

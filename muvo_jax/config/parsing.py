@@ -30,7 +30,8 @@ def parse(cls, values: dict[str, Any], path: str):
     """
     if not isinstance(values, dict):
         raise ValueError(f"{path}: got {values!r}, expected the fields of {cls.__name__}.")
-    hints = {field.name: typing.get_type_hints(cls)[field.name] for field in dataclasses.fields(cls) if field.init}
+    types_of = typing.get_type_hints(cls)
+    hints = {field.name: types_of[field.name] for field in dataclasses.fields(cls) if field.init}
     for name in values:
         check_choice(f"{path} ({cls.__name__})", name, tuple(hints))
     fields = {name: _coerce(hints[name], value, f"{path}.{name}") for name, value in values.items()}

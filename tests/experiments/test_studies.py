@@ -198,7 +198,7 @@ def test_findings_are_written_between_the_marks(tmp_path):
 
 
 def test_results_of_other_code_are_refused_and_both_are_named(tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr(command_line, "use_compilation_cache", lambda: None)
+    monkeypatch.setattr(command_line, "prepare_compiler", lambda: None)
     folder = tmp_path / "fusion-smoke"
     folder.mkdir()
     (folder / report.RESULTS).write_text(json.dumps(
@@ -211,7 +211,7 @@ def test_results_of_other_code_are_refused_and_both_are_named(tmp_path, capsys, 
 
 def test_runs_that_results_have_scores_of_are_not_made_again_even_where_their_folders_are_gone(
         tmp_path, monkeypatch):
-    monkeypatch.setattr(command_line, "use_compilation_cache", lambda: None)
+    monkeypatch.setattr(command_line, "prepare_compiler", lambda: None)
     made = []
     monkeypatch.setattr(queue, "make", lambda study, scale, job, *_: made.append(job.name))
     runs = {arm.name: {"0": _run_of(20.0)} for arm in tables.OCCUPANCY.arms if arm.name != "PTF"}
@@ -235,7 +235,7 @@ def test_runs_that_were_judged_by_two_cards_are_not_compared(tmp_path):
     (["fusion", "--scale=twon"], "Did you mean town"), (["fusion", "--shard=2/2"], "an index from 0 to COUNT - 1"),
     (["fusion", "--scale=paper"], "give --data=PATH")])
 def test_wrong_words_are_named_with_their_neighbours(arguments, message, capsys, monkeypatch):
-    monkeypatch.setattr(command_line, "use_compilation_cache", lambda: None)
+    monkeypatch.setattr(command_line, "prepare_compiler", lambda: None)
     assert command_line.run(study_command.Options, study_command.run, program="run", arguments=arguments) == 1
     assert message in capsys.readouterr().err
 
@@ -297,7 +297,7 @@ def test_pairs_that_share_an_arm_are_one_difference_for_each_seed():
 
 @pytest.mark.parametrize("flags", [[], ["--no-memory"], ["--seeds=1"], ["--seeds=3"]])
 def test_no_call_loses_what_results_hold(tmp_path, monkeypatch, flags):
-    monkeypatch.setattr(command_line, "use_compilation_cache", lambda: None)
+    monkeypatch.setattr(command_line, "prepare_compiler", lambda: None)
     runs = {arm.name + suffix: {str(seed): _run_of(20.0) for seed in range(2)}
             for arm in tables.OCCUPANCY.arms for suffix in ("", "+memory")}
     out = _recorded(tmp_path, runs)

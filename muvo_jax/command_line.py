@@ -24,8 +24,6 @@ import tyro
 from muvo_jax import late
 
 with late.imports():
-    import jax
-
     from muvo_jax import recordings
     from muvo_jax.training import checkpoint, host, screen
 
@@ -82,7 +80,7 @@ def run(options_type: type[_Options], work: Callable[[_Options, screen.Screen], 
         warnings.showwarning = lambda message, *_, **__: show.warn(str(message))  # type: ignore[assignment]
         try:
             return status(work(options, show))
-        except (*EXPECTED_ERRORS, jax.errors.JaxRuntimeError) as error:
+        except (*EXPECTED_ERRORS, RuntimeError) as error:  # JAX's of memory are RuntimeErrors
             said = explained(error)
             if said is None:
                 raise

@@ -3,7 +3,8 @@
     with late.imports():
         from muvo_jax.training import loop
 
-binds `loop` at once, but runs its file when one of its names is first asked for, or at `late.load()`.
+binds `loop` at once, but runs its file when one of its names is first asked for, or at `late.load()`. An `import jax`
+of what already waits runs it (Python asks it for its `__spec__`), so only the command itself has one.
 """
 
 from __future__ import annotations

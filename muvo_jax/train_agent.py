@@ -15,7 +15,6 @@ from muvo_jax import command_line, late
 
 with late.imports():
     import jax
-    import jax.numpy as jnp
     import numpy as np
 
     from muvo_jax import evaluation_report, town_drive
@@ -142,7 +141,7 @@ def recorded_params(world: environment.Environment, loaded: run_lib.Run, count: 
     for first in range(0, count, OBSERVED_AT_ONCE):
         part = jax.tree.map(lambda leaf, first=first: leaf[first:first + OBSERVED_AT_ONCE], batch)
         observed.append(rollout.observe(loaded.model, loaded.variables, jax.random.key(0), part, sampled=False))
-    together = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *observed)
+    together = jax.tree.map(lambda *leaves: jax.numpy.concatenate(leaves), *observed)
     return world.params(loaded.variables, world.starts(together, batch, skip=batch.frames - 1), horizon=1,
                         temperature=0.0)
 
@@ -158,7 +157,7 @@ def dreamt(world, params, config, learner, key, options) -> futures_lib.Futures:
 
 def lessons(world, config, pool, key, learner, options):
     """A round's updates: the learner after them, and the mean of their metrics over the last ten."""
-    together = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *pool)
+    together = jax.tree.map(lambda *leaves: jax.numpy.concatenate(leaves), *pool)
     seen = []
     for update in range(options.updates):
         key_choice, key_update = jax.random.split(jax.random.fold_in(key, update))

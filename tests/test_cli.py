@@ -90,12 +90,13 @@ def test_the_readme_lists_every_command():
 
 @pytest.mark.parametrize("command", listing.COMMANDS)
 def test_help_loads_nothing_that_takes_long(command):
-    """What `--help` costs is what it imports: JAX for some commands, the libraries of training for none."""
+    """What `--help` costs is what it imports. JAX reads where compiled programs are kept when it is imported: later."""
     done = _command(f"muvo_jax.{command}", "--help", PYTHONPROFILEIMPORTTIME="1")
     assert done.returncode == 0, done.stderr[-2000:]
     assert "Examples:" in done.stdout
-    loaded = {line.rpartition("|")[2].strip().partition(".")[0] for line in done.stderr.splitlines()}
-    assert "tyro" in loaded and not loaded & {"flax", "optax", "orbax", "grain", "tensorstore", "chex", "torch"}
+    loaded = {line.rpartition("|")[2].strip() for line in done.stderr.splitlines()}
+    assert "tyro" in loaded
+    assert not loaded & {"jax._src", "flax", "optax", "orbax", "grain", "tensorstore", "chex", "torch"}
 
 
 @pytest.mark.parametrize("called", ["record_carla", "record-carla", "interop.export_torch", "export-torch"])

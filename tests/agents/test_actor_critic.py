@@ -1,5 +1,7 @@
 """The actor-critic: lambda returns by hand, and learning what is easy to learn."""
 
+import functools
+
 import chex
 import jax
 import jax.numpy as jnp
@@ -73,7 +75,8 @@ def test_steps_after_the_end_of_an_episode_teach_nothing():
     world, _ = worlds.make(reward_function=lambda moment: (moment.after.speed_mps, False, {}), reward_heads=())
     learner = actor_critic.init(jax.random.key(0), world, config)
     params = world.params(worlds.variables(), worlds.bank(), 2)
-    seen, drawn, transitions = actor_critic.imagine(world, config, params, jax.random.key(1), learner.actor)
+    seen, drawn, transitions = jax.jit(functools.partial(actor_critic.imagine, world, config))(
+        params, jax.random.key(1), learner.actor)
     assert transitions.truncated.tolist() == [[False, False], [True, True], [True, True], [True, True]]
 
     def learned(reward):

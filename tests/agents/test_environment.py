@@ -100,8 +100,8 @@ def test_gradients_reach_actions_and_a_predicted_collision_ends_the_drive():
 def test_by_default_a_model_at_even_odds_ends_no_drive():
     environment, params = make(reward_config=rewards.RewardConfig())
     params = dataclasses.replace(params, variables=jax.tree.map(jnp.zeros_like, params.variables))
-    _, states = jax.vmap(environment.reset, (0, None))(jax.random.split(jax.random.key(0), 4), params)
-    _, transitions = jax.vmap(environment.step, (0, 0, None, None))(
+    _, states = jax.jit(jax.vmap(environment.reset, (0, None)))(jax.random.split(jax.random.key(0), 4), params)
+    _, transitions = jax.jit(jax.vmap(environment.step, (0, 0, None, None)))(
         jax.random.split(jax.random.key(1), 4), states, ACTION, params)
     np.testing.assert_allclose(transitions.terms["collision"], 0.5, atol=1e-3)
     assert not transitions.terminated.any()

@@ -181,8 +181,8 @@ def test_shared_futures_restart_where_a_drive_is_over(imagined):
     world, _, futures = imagined
     shared = futures_lib.SharedFutures(world)
     params = shared.params(futures)
-    observation, state = shared.reset(jax.random.key(0), params)
-    moved, transition = shared.step(jax.random.key(1), state, jnp.zeros(2), params)
+    observation, state = jax.jit(shared.reset)(jax.random.key(0), params)
+    moved, transition = jax.jit(shared.step)(jax.random.key(1), state, jnp.zeros(2), params)
     for final, time in ((False, 1), (True, 0)):
         after, seen = shared.restart(jax.random.key(2), moved, transition.observation, jnp.bool_(final), params)
         assert int(after.time) == time and seen.shape == observation.shape

@@ -104,7 +104,7 @@ def test_the_plan_whose_future_is_shared_is_worth_what_it_is_in_its_own():
     environment, params = make(reward_config=rewards.RewardConfig(occupancy_scale=2, tolerated_collision=0.0))
     _, state = environment.reset(jax.random.key(0), params)
     plans = jax.random.uniform(jax.random.key(1), (3, 3, 2), minval=-1)
-    shared, own = (returns(environment, params, state)(jax.random.key(3), plans)
+    shared, own = (jax.jit(returns(environment, params, state))(jax.random.key(3), plans)
                    for returns in (planners.shared_future_returns, planners.imagined_returns))
     np.testing.assert_allclose(shared[0], own[0], rtol=1e-4)
     assert np.abs(shared[1:] - own[1:]).max() > 1e-4  # the others see its future, not theirs

@@ -1,6 +1,7 @@
 """A mirrored window is the window of the mirrored world: every field against the geometry that makes it."""
 
 import dataclasses
+import functools
 
 import jax
 import jax.numpy as jnp
@@ -153,8 +154,8 @@ def test_training_sees_it_and_validation_does_not():
     variables = model.init()
 
     def loss(config, train):
-        total, _ = step_lib.forward(variables["params"], variables["batch_stats"], batch, keys, model=model,
-                                    config=config, train=train, axis_name=None)
+        forward = jax.jit(functools.partial(step_lib.forward, model=model, config=config, train=train, axis_name=None))
+        total, _ = forward(variables["params"], variables["batch_stats"], batch, keys)
         return float(total)
 
     assert loss(config, True) != loss(presets.tiny(), True)

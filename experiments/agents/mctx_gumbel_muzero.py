@@ -32,7 +32,8 @@ def main():
         root = model.root(search_params, key, state)
         output = mctx.gumbel_muzero_policy(search_params, key, root, model.recurrent_fn,
                                            num_simulations=options.simulations, max_depth=options.horizon,
-                                           max_num_considered_actions=len(grid))
+                                           max_num_considered_actions=len(grid),
+                                           gumbel_scale=0.0)  # the best action found: nothing is to be explored
         return model.action(root, output.action)
 
     drivers = {

@@ -39,7 +39,7 @@ def test_ppo_learns_in_imagination(name, library, steps):
 
 @pytest.mark.slow
 def test_gumbel_muzero_plans_better_than_chance():
-    search, coasting, random = returns("mctx_gumbel_muzero", "mctx", "--simulations=16")
+    search, coasting, random = returns("mctx_gumbel_muzero", "mctx")
     assert search > coasting and search > random
 
 

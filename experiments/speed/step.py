@@ -1,8 +1,8 @@
-"""Where a training step's time goes: python experiments/speed/step.py [--preset=town] [--set KEY=VALUE ...]
+"""Where a training step's time goes: python experiments/speed/step.py [--preset=town] [--set KEY=VALUE ...] [--whole]
 
 A row for each part of the step, forward and with its gradients: processor seconds, the arithmetic of its matrix
 products and convolutions, and its share of what a float32 product of 2048x2048 reaches in the same run. Random frames
-of the preset's sizes, fresh weights.
+of the preset's sizes, fresh weights. `--whole` leaves the parts out.
 """
 
 import argparse
@@ -27,9 +27,9 @@ from muvo_jax.types import Batch
 
 
 def random_batch(config: config_lib.Config) -> Batch:
-    """Windows as long as training's of the sizes of a config with camera, range view, route and occupancy."""
+    """The windows of an update, of the sizes of a config with camera, range view, route and occupancy."""
     random, model, view = np.random.default_rng(0), config.model, config.model.range_view
-    lead = (config.train.batch, config.data.frames)
+    lead = (config.train.batch * config.optimizer.accumulate, config.data.frames)
     beams = range_view.beam_directions(view)
     road_m = view.position_m[2] / np.maximum(-beams[..., 2], 1e-3)
     range_m = np.minimum(20.0, road_m) * random.uniform(0.9, 1.0, (*lead, 1, 1))
@@ -115,12 +115,12 @@ def both_ways(function):
     return run
 
 
-def profile(config: config_lib.Config, rounds: int, rate: float) -> None:
+def profile(config: config_lib.Config, rounds: int, rate: float, whole_only: bool = False) -> None:
     """Prints a row for each part of the step and one for the whole; `rate` is that of a product (cost.product_rate)."""
     batch = random_batch(config)
     print("| part | forward (s) | with gradients (s) | arithmetic (GFLOP) | share of the product's speed |")
     print("|---|---:|---:|---:|---:|")
-    for name, (function, arguments, _) in parts(config, batch).items():
+    for name, (function, arguments, _) in (() if whole_only else parts(config, batch).items()):
         forward, whole = jax.jit(function), jax.jit(both_ways(function))
         taken = timing.processor_seconds({"forward": lambda run=forward, given=arguments: run(*given),
                                           "whole": lambda run=whole, given=arguments: run(*given)}, rounds)
@@ -158,6 +158,7 @@ def main():
     parser.add_argument("--preset", default="town")
     parser.add_argument("--set", nargs="*", default=[], metavar="KEY=VALUE")
     parser.add_argument("--rounds", type=int, default=3)
+    parser.add_argument("--whole", action="store_true")
     options = parser.parse_args()
     host.restart_with_huge_pages()  # as `train` does
     host.use_plain_emitters()
@@ -166,7 +167,7 @@ def main():
         name: json.loads(value) if value[:1] in "0123456789tf[" else value for name, value in chosen.items()})
     rate = cost.product_rate()
     print(f"float32 product of {cost.GEMM_SIDE}x{cost.GEMM_SIDE}: {rate / 1e9:.0f} GFLOP a processor second\n")
-    profile(config, options.rounds, rate)
+    profile(config, options.rounds, rate, options.whole)
 
 
 if __name__ == "__main__":

@@ -11,7 +11,7 @@ from muvo_jax.config import LastSeen, LossConfig, ModelConfig, VoxelGrid, as_kin
 from muvo_jax.metrics import baselines, occupancy, points, scans, streaming
 from muvo_jax.model import decoders, glimpse, tokens
 from muvo_jax.objectives import chamfer, labels, regression
-from muvo_jax.ops import range_view
+from muvo_jax.ops import range_view, reproject
 
 _NEAR_M = 10.0  # ranges are seen as 10 m / (10 m + range) too: near ones matter
 
@@ -32,10 +32,7 @@ def along_beams(raw: types.Array, scale: int, config: ModelConfig) -> types.Arra
 
 def _apart(view: types.Array, scale: int, config: ModelConfig) -> types.Array:
     """How far the points of a range view [..., Hr/scale, Wr/scale, 4] lie from their pixels' beams [..., 3], m."""
-    geometry, lead = config.range_view, (1,) * (view.ndim - 3)
-    beams = range_view.beam_directions(geometry)[::scale, ::scale]
-    position_m = np.asarray(geometry.position_m, np.float32).reshape(*lead, 1, 1, 3)
-    return view[..., :3] - beams.reshape(*lead, *beams.shape) * view[..., 3:] - position_m
+    return view[..., :3] - reproject.beam_points(view[..., 3], config.range_view, scale)
 
 
 def _finish(value: types.Array, scale: int, config: ModelConfig) -> types.Array:

@@ -109,7 +109,7 @@ def conv_transpose(x, kernel, *, stride: PerAxis = 1, padding: PerAxis = 0, outp
         raise ValueError(f"conv_transpose: input {x.shape[1:-1]}, kernel {taps}, stride {strides} and padding {pads} "
                          f"give an output of size {outs}; reduce the padding.")
     if implementation == "xla":
-        return _dilated(x, kernel, strides, pads, outs)
+        return conv_cpu.dilated(x, kernel, strides, pads, outs)
     if math.prod(x.shape[1:-1]) == 1:
         return _from_one_pixel(x, kernel, pads, outs)
     if rank == 1:
@@ -253,18 +253,6 @@ def _cpu_conv(x, kernel, strides, pairs):
     if max(strides) == 1:
         return conv_cpu.dense(x, kernel, pairs)
     return conv_cpu.strided(x, kernel, strides, pairs)
-
-
-def _dilated(x, kernel, strides, pads, outs):
-    """The definition: zeros between the inputs, then a convolution with the flipped kernel."""
-    rank = len(strides)
-    taps = kernel.shape[:rank]
-    edges = tuple((k - 1 - p, o - ((n - 1) * s + 1) + p)
-                  for n, k, s, p, o in zip(x.shape[1:-1], taps, strides, pads, outs, strict=True))
-    space = "XYZ"[:rank]
-    return lax.conv_general_dilated(x, jnp.flip(kernel, tuple(range(rank))), (1,) * rank, edges, lhs_dilation=strides,
-                                    dimension_numbers=(f"N{space}C", f"{space}IO", f"N{space}C"),
-                                    precision=precision.PRODUCTS)
 
 
 def _from_one_pixel(x, kernel, pads, outs):

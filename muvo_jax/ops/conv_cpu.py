@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import functools
 import math
+from collections.abc import Sequence
 
 import jax
 import jax.numpy as jnp
@@ -37,6 +38,17 @@ def plain(x, kernel, stride: tuple[int, ...], padding: Pairs, kernel_dilation: t
     """XLA's convolution of channels-last `x` [N, *S, C] with `kernel` [*K, C, O]."""
     space = "XYZ"[: kernel.ndim - 2]
     return lax.conv_general_dilated(x, kernel, stride, padding, rhs_dilation=kernel_dilation,
+                                    dimension_numbers=(f"N{space}C", f"{space}IO", f"N{space}C"),
+                                    precision=precision.PRODUCTS)
+
+
+def dilated(x, kernel, stride: Sequence[int], padding: Sequence[int], outs: Sequence[int]):
+    """A transposed convolution to `outs` pixels by definition: zeros between the inputs, then the flipped kernel."""
+    rank = len(stride)
+    edges = [(k - 1 - p, o - ((n - 1) * s + 1) + p)
+             for n, k, s, p, o in zip(x.shape[1:-1], kernel.shape[:rank], stride, padding, outs, strict=True)]
+    space = "XYZ"[:rank]
+    return lax.conv_general_dilated(x, jnp.flip(kernel, tuple(range(rank))), (1,) * rank, edges, lhs_dilation=stride,
                                     dimension_numbers=(f"N{space}C", f"{space}IO", f"N{space}C"),
                                     precision=precision.PRODUCTS)
 
@@ -124,8 +136,8 @@ def _whole_kernel_gradient(x, gradient, taps: tuple[int, ...], stride: tuple[int
     """XLA's own kernel gradient [*taps, C, O]: a convolution over all of the image, channels its samples.
 
     Written with the axes in the order that XLA's CPU backend has fast code for. It brings others into this order in the
-    outermost computation of a program alone: what differentiation gives runs 15 times slower inside a loop, such as
-    accumulation or the scan over frames of train.remat.
+    outermost computation of a program alone: what differentiation gives runs ten times slower inside a loop, such as
+    accumulation or the scan over frames of train.remat (docs/performance.md, "Kernel gradients in loops").
     """
     reach = [(k - 1) * d + (n - 1) * s + 1
              for k, d, n, s in zip(taps, dilation, gradient.shape[1:3], stride, strict=True)]
@@ -263,13 +275,8 @@ def _strided_2d_backward(stride, padding, residuals, gradient):
     if not _xla_gradient_is_fast(x, kernel, gradient):
         _, pull_back = jax.vjp(functools.partial(_strided_by_phases, stride=stride, padding=padding), x, kernel)
         return pull_back(gradient)
-    taps = kernel.shape[:2]
-    edges = [(k - 1 - low, n + low - (m - 1) * s - 1) for k, n, m, s, (low, _) in zip(
-        taps, x.shape[1:3], gradient.shape[1:3], stride, padding, strict=True)]
-    x_gradient = lax.conv_general_dilated(gradient, kernel[::-1, ::-1].swapaxes(2, 3), (1, 1), edges,
-                                          lhs_dilation=stride, dimension_numbers=("NHWC", "HWIO", "NHWC"),
-                                          precision=precision.PRODUCTS)
-    return x_gradient, _whole_kernel_gradient(x, gradient, taps, stride, padding, (1, 1))
+    x_gradient = dilated(gradient, kernel.swapaxes(2, 3), stride, [low for low, _ in padding], x.shape[1:3])
+    return x_gradient, _whole_kernel_gradient(x, gradient, kernel.shape[:2], stride, padding, (1, 1))
 
 
 _strided_2d.defvjp(_strided_2d_forward, _strided_2d_backward)

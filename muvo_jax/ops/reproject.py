@@ -203,10 +203,15 @@ def lies_on_beams(range_view: Array, geometry: RangeViewGeometry) -> Array:
     return 2 * middle > returned.sum(axis=(1, 2))
 
 
-def beam_points(range_m: Array, geometry: RangeViewGeometry) -> Array:
-    """The points [N, Hr, Wr, 3] (ego frame) in the middle of the pixels at ranges [N, Hr, Wr]."""
-    beams = jnp.asarray(range_view_ops.beam_directions(geometry))[None]
-    return beams * jnp.expand_dims(range_m, -1) + _lidar_m(geometry)[None]
+def beam_points(range_m: Array, geometry: RangeViewGeometry, scale: int = 1) -> Array:
+    """The points [..., Hr, Wr, 3] (ego frame) in the middle of the pixels at ranges [..., Hr, Wr].
+
+    Of a smaller picture [..., Hr/scale, Wr/scale] in the middle of those that it keeps.
+    """
+    beams = jnp.asarray(range_view_ops.beam_directions(geometry))[::scale, ::scale]
+    lead = (1,) * (range_m.ndim - 2)
+    return (beams.reshape(*lead, *beams.shape) * jnp.expand_dims(range_m, -1)
+            + _lidar_m(geometry).reshape(*lead, 1, 1, 3))
 
 
 def fill_holes(range_m: Array, sky: Array, geometry: RangeViewGeometry, rounds: int = 2) -> Array:

@@ -184,13 +184,20 @@ def layout(tmp_path):
     return tmp_path
 
 
+def keep_rows(run, count, without=()):
+    """Cuts a run's table down to its first rows; returns its columns."""
+    columns = {name: cells[:count] for name, cells in safe_pickle.load_table(run / muvo_runs.FRAME_FILE).items()
+               if name not in without}
+    (run / muvo_runs.FRAME_FILE).write_bytes(voxelizing.frame_pickle.frame(columns))
+    return columns
+
+
 @needs_layout
 def test_the_reference_rule_writes_the_authors_voxels(layout):
     run = layout / "trainval/train/Town01/0000"
     table = safe_pickle.load_table(run / muvo_runs.FRAME_FILE)
     shutil.rmtree(run / "voxel")
-    columns = {name: cells[:12] for name, cells in table.items() if name != "voxel_path"}
-    (run / muvo_runs.FRAME_FILE).write_bytes(voxelizing.frame_pickle.frame(columns))
+    columns = keep_rows(run, 12, without=("voxel_path",))
     assert voxelizing.voxelize(layout, rule="reference", workers=2) == (12, 0)
     for path in (run / "voxel").glob("*.npy"):
         assert path.read_bytes() == (samples.MUVO_LAYOUT / path.relative_to(layout)).read_bytes()
@@ -205,9 +212,7 @@ def test_the_reference_rule_writes_the_authors_voxels(layout):
 @needs_layout
 def test_carved_occupancy_of_the_layout_is_read_in_place_of_its_voxels(layout):
     run = layout / "trainval/train/Town01/0000"
-    table = safe_pickle.load_table(run / muvo_runs.FRAME_FILE)
-    (run / muvo_runs.FRAME_FILE).write_bytes(voxelizing.frame_pickle.frame(
-        {name: cells[:12] for name, cells in table.items()}))
+    keep_rows(run, 12)
     opened = muvo_reader.MuvoRecording(layout)
     theirs = opened.read(opened.sequences[0], 1)["occupancy"]
     before = (run / "voxel/voxel_000000011.npy").read_bytes()
@@ -234,9 +239,7 @@ def without_row(table, row):
 def test_frames_keep_their_occupancy_when_a_row_is_taken_out_of_the_table(layout, rule):
     run = layout / "trainval/train/Town01/0000"
     shutil.rmtree(run / "voxel")
-    table = safe_pickle.load_table(run / muvo_runs.FRAME_FILE)
-    (run / muvo_runs.FRAME_FILE).write_bytes(voxelizing.frame_pickle.frame(
-        {name: cells[:4] for name, cells in table.items() if name != "voxel_path"}))
+    keep_rows(run, 4, without=("voxel_path",))
     assert voxelizing.voxelize(layout, rule=rule, workers=1) == (4, 0)
     whole = muvo_reader.MuvoRecording(layout, skipped_s=0.0)
     expected = whole.read(whole.sequences[0], 2)
@@ -253,9 +256,7 @@ def test_frames_keep_their_occupancy_when_a_row_is_taken_out_of_the_table(layout
 @needs_layout
 def test_voxels_of_the_layout_are_kept_by_their_form(layout):
     run = layout / "trainval/train/Town01/0000"
-    table = safe_pickle.load_table(run / muvo_runs.FRAME_FILE)
-    (run / muvo_runs.FRAME_FILE).write_bytes(voxelizing.frame_pickle.frame(
-        {name: cells[:12] for name, cells in table.items()}))
+    keep_rows(run, 12)
     theirs = run / "voxel/voxel_000000003.npy"
     theirs.write_bytes(theirs.read_bytes()[:-8])  # an interrupted copy
     assert voxelizing.voxelize(layout, rule="reference", workers=1) == (1, 11)

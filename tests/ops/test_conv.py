@@ -158,7 +158,7 @@ def test_kernel_gradient_does_not_depend_on_the_chunks(chunk_bytes, monkeypatch,
 
 @pytest.mark.parametrize(("size", "taps", "stride"), [((9, 8), 3, 1), ((9, 8), 3, 2), ((12, 7), 7, 2), ((8, 8), 6, 3)])
 def test_gradients_inside_a_loop_are_of_the_form_that_is_fast_there(size, taps, stride, monkeypatch, strict_dtypes):
-    """XLA's CPU backend reorders axes in the outermost computation alone; in loops other orders are 15 times slower."""
+    """XLA's CPU backend reorders axes in the outermost computation alone; in loops other orders are far slower."""
     monkeypatch.setattr(conv_cpu, "_LITTLE_WORK", math.inf)
     random = np.random.default_rng(0)
     x, kernel = (random.normal(size=shape).astype(np.float32) for shape in ((2, *size, 3), (taps, taps, 3, 4)))

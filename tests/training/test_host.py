@@ -10,7 +10,7 @@ from muvo_jax.training import host
 
 @pytest.mark.parametrize(("before", "after"), [
     ("", "--xla_cpu_use_fusion_emitters=false"),
-    ("--xla_dump_to=/tmp/x", "--xla_dump_to=/tmp/x --xla_cpu_use_fusion_emitters=false"),
+    ("--xla_dump_to=dump", "--xla_dump_to=dump --xla_cpu_use_fusion_emitters=false"),
     ("--xla_cpu_use_fusion_emitters=true", "--xla_cpu_use_fusion_emitters=true")])
 def test_emitters_are_chosen_unless_the_user_did(before, after, monkeypatch):
     monkeypatch.setattr(jaxlib.version, "__version__", "0.10.2")

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Collection, Iterable
+from collections.abc import Collection, Hashable, Iterable
+from typing import TypeVar
 
 import numpy as np
 
@@ -12,6 +13,18 @@ from muvo_jax.data import schema, words
 GAP_PERIODS = 1.5  # a time step longer than this many periods is a gap
 SAME_RATE = 0.1  # the share by which a run's usual step may differ from the recording's
 FEW_SHARE = 0.05  # gaps at no more frames than these (or at one) are what recordings have; more are a fault
+
+_Name = TypeVar("_Name", bound=Hashable)
+_Value = TypeVar("_Value")
+
+
+def named_twice(pairs: Iterable[tuple[_Name, _Value]]) -> tuple[_Name, _Value, _Value] | None:
+    """The first name that two different things have, and both of them; None where every name is that of one."""
+    first: dict[_Name, _Value] = {}
+    for name, value in pairs:
+        if first.setdefault(name, value) != value:
+            return name, first[name], value
+    return None
 
 
 def check_increasing(timestamps_s: np.ndarray, where: Iterable[str]) -> None:

@@ -43,20 +43,16 @@ def test_the_step_is_compiled_once_and_nothing_after_the_first_validation(tmp_pa
     assert "compiled" not in happened[steps[2]:second + 1]
 
 
-def test_an_early_step_is_taken_only_where_the_data_changed_none_of_its_settings():
+def test_an_early_step_is_taken_only_where_the_data_changed_none_of_its_settings(monkeypatch):
     config = _config()
     shapes = preparation.expected_batch(config, 2)
     early = preparation.Prepared(config, None, None, None, shapes, 0.0, 0.0)
     anew = object()
-    patch = pytest.MonkeyPatch()
-    patch.setattr(preparation, "prepare", lambda *_: anew)
-    try:
-        elsewhere = config_lib.override_all(config, {"data.path": "other", "evaluation.windows": 3})
-        assert preparation.recompile(early, elsewhere, shapes) is early
-        for name, value in (("train.observe_frames", 1), ("loss.kl", 0.5), ("augmentation.mirror", True),
-                            ("data.route_map.metres_per_px", 0.9)):
-            changed = config_lib.override_all(config, {name: value})
-            assert preparation.recompile(early, changed, shapes) is anew, name
-        assert preparation.recompile(early, config, preparation.expected_batch(config, 3)) is anew
-    finally:
-        patch.undo()
+    monkeypatch.setattr(preparation, "prepare", lambda *_: anew)
+    elsewhere = config_lib.override_all(config, {"data.path": "other", "evaluation.windows": 3})
+    assert preparation.recompile(early, elsewhere, shapes) is early
+    for name, value in (("train.observe_frames", 1), ("loss.kl", 0.5), ("augmentation.mirror", True),
+                        ("data.route_map.metres_per_px", 0.9)):
+        changed = config_lib.override_all(config, {name: value})
+        assert preparation.recompile(early, changed, shapes) is anew, name
+    assert preparation.recompile(early, config, preparation.expected_batch(config, 3)) is anew

@@ -108,8 +108,8 @@ def test_eight_devices_give_the_gradients_of_one(latent):
     Two parts: what one device answers to its windows in another order (the same sums, added up differently, and all
     that follows), once for each of the partial sums; and the rounding of n additions inside a window, which devices
     compile differently: sqrt(n) times half a unit in the last place, n the pixels and voxels of a leaf's longest sum.
-    A fault as small as two windows that draw each other's randomness is ten times that in every gradient, and more in
-    all but few: an L1 and offsets from beams tell least of it (37 times, the bias of the half-size range view).
+    A fault as small as two windows that draw each other's randomness is a hundred times that in every gradient, but for
+    those of the ranges' decoder: an L1 and offsets from beams tell least of it (37 times, the half-size view's bias).
     """
     config = config_of(latent)
     model = world_model.WorldModel(config.model)
@@ -144,4 +144,6 @@ def test_eight_devices_give_the_gradients_of_one(latent):
     # A bias in front of a BatchNorm has a true gradient of zero: all of it is rounding.
     gradients = [name for name in size if name.startswith("[0]") and size[name] > rounding[name]]
     assert len(gradients) > 0.95 * len(jax.tree.leaves(one[0]))
-    assert not {name: (faulty[name], rounding[name]) for name in gradients if faulty[name] < 10 * rounding[name]}
+    least = lambda name: 10 if "decoders_range_view" in name else 100
+    assert not {name: (faulty[name], rounding[name]) for name in gradients
+                if faulty[name] < least(name) * rounding[name]}

@@ -241,12 +241,10 @@ def read_sensors(path: pathlib.Path) -> tuple[dict, pathlib.Path]:
 
 def _check_names(every: list[muvo_runs.Run], path: pathlib.Path) -> None:
     """Raises DataError where two runs have one name, such as those of two recordings in one folder."""
-    folders: dict[str, pathlib.Path] = {}
-    for run in every:
-        other = folders.setdefault(run.name, run.folder)
-        if other != run.folder:
-            raise schema.DataError(f"{path}: {other} and {run.folder} are both run {run.name}. Read the recordings one "
-                                   f"by one, or rename one of the folders.")
+    if twice := sequences.named_twice((run.name, run.folder) for run in every):
+        name, one, other = twice
+        raise schema.DataError(f"{path}: {one} and {other} are both run {name}. Read the recordings one by one, or "
+                               f"rename one of the folders.")
 
 
 def _is_carved(kept: list[muvo_runs.Run]) -> bool:

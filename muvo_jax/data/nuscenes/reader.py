@@ -202,12 +202,10 @@ def _scenes(folder: pathlib.Path, camera: str, *, key_frames: bool) -> list[scen
 
 def _check_names(named: dict[str, str], folder: pathlib.Path) -> None:
     """Raises DataError where two scenes (token -> name) have one name."""
-    tokens: dict[str, str] = {}
-    for token, name in named.items():
-        other = tokens.setdefault(name, token)
-        if other != token:
-            raise schema.DataError(f"{folder / 'scene.json'}: rows {other} and {token} are both named {name}. Unpack "
-                                   f"the metadata again; of tables that were put together, rename one.")
+    if twice := sequences.named_twice((name, token) for token, name in named.items()):
+        name, one, other = twice
+        raise schema.DataError(f"{folder / 'scene.json'}: rows {one} and {other} are both named {name}. Unpack the "
+                               f"metadata again; of tables that were put together, rename one.")
 
 
 def _fields_of(scene: scenes.Scene) -> frozenset[str]:

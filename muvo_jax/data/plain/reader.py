@@ -268,12 +268,10 @@ def read_runs(root: pathlib.Path, splits: tuple[str, ...]) -> list[Run]:
     if not found:
         raise schema.DataError(f"{root}: no complete run (a folder <split>/<run> with {FRAMES_FILE}) in the splits "
                                f"{', '.join(splits)}. The root holds {files.listing(root)}. Record it again.")
-    names: dict[pathlib.Path, str] = {}
-    for run in found:
-        other = names.setdefault(run.folder.resolve(), run.name)
-        if other != run.name:  # a split linked to another one would be judged on what was trained
-            raise schema.DataError(f"{root}: {other} and {run.name} are one folder, {run.folder.resolve()}. Remove one "
-                                   f"of the links.")
+    # A split linked to another one would be judged on what was trained.
+    if twice := sequences.named_twice((run.folder.resolve(), run.name) for run in found):
+        folder, one, other = twice
+        raise schema.DataError(f"{root}: {one} and {other} are one folder, {folder}. Remove one of the links.")
     return found
 
 

@@ -37,9 +37,9 @@ def restart_with_huge_pages() -> None:
 def use_plain_emitters() -> None:
     """Has XLA generate code for the CPU without its fusion emitters, in programs that are compiled from here on.
 
-    With them (the default of jaxlib 0.10) the town's training step takes a tenth more processor time, its compilation a
-    quarter more, and small programs compile twice as long (docs/performance.md, "Start-up"). XLA reads its flags
-    before its first computation, hence an environment variable; a choice of the user's is left alone.
+    With them (the default of jaxlib 0.10) the town's training step and its compilation take a tenth more processor
+    time, and small programs compile twice as long (docs/performance.md, "Start-up"). XLA reads its flags before its
+    first computation, hence an environment variable; a choice of the user's is left alone.
     """
     flags = os.environ.get(FLAGS_VARIABLE, "")
     if jaxlib.version.__version__.startswith(EMITTERS_OF) and EMITTERS not in flags:

@@ -225,7 +225,8 @@ def forward(params: Any, batch_stats: Any, batch: types.Batch, keys: types.Array
     if train:
         shown = augmentation.augment(shown, keys, config.augmentation)
         if config.train.restart:
-            shown = dataclasses.replace(shown, is_first=_restarted(shown.is_first, keys))
+            batch = dataclasses.replace(batch, is_first=_restarted(batch.is_first, keys, seen))
+            shown = dataclasses.replace(shown, is_first=batch.is_first[:, :seen])
     observed, batch_stats = rollout.observe_window(model, variables, shown, keys, train=train, axis_name=axis_name,
                                                    remat=config.train.remat == "frames")
     states, memory = observed.states, observed.memory
@@ -258,14 +259,14 @@ def _and_imagined(model: world_model.WorldModel, variables: types.Variables, obs
     return jax.tree.map(lambda *parts: jnp.concatenate(parts, axis=1), observed.states, dream.states)
 
 
-def _restarted(is_first: types.ArrayLike, keys: types.Array) -> types.Array:
-    """bool [B, T]: each window is cut in two at a frame drawn anew (or not at all, at the first).
+def _restarted(is_first: types.ArrayLike, keys: types.Array, seen: int) -> types.Array:
+    """bool [B, T]: each window is cut in two at one of its `seen` observed frames, drawn anew (or not, at the first).
 
-    So the last observed state has seen 1 to T frames, and a dream starts from any of these.
+    So the last observed state has seen 1 to `seen` frames, and a dream starts from any of these. The losses are told
+    too: at the cut no motion since the frame before is to be known.
     """
-    frames = is_first.shape[1]
-    at = jax.vmap(lambda key: jax.random.randint(jax.random.fold_in(key, _RESTART_SITE), (), 0, frames))(keys)
-    return jnp.asarray(is_first) | (jnp.arange(frames)[None] == at[:, None])
+    at = jax.vmap(lambda key: jax.random.randint(jax.random.fold_in(key, _RESTART_SITE), (), 0, seen))(keys)
+    return jnp.asarray(is_first) | (jnp.arange(is_first.shape[1])[None] == at[:, None])
 
 
 def _some_frames(states: types.LatentState, batch: types.Batch, keys: types.Array,

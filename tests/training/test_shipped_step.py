@@ -15,6 +15,7 @@ from muvo_jax.model import world_model
 from muvo_jax.ops import camera, range_view
 from muvo_jax.training import optimizer as optimizer_lib
 from muvo_jax.training import parallel as parallel_lib
+from muvo_jax.training import preparation
 from muvo_jax.training import state as state_lib
 from muvo_jax.training import step as step_lib
 
@@ -30,18 +31,44 @@ def keys(step, count=64):
 
 def test_a_window_is_cut_at_a_frame_of_its_own_drawn_anew_in_each_step():
     is_first = np.broadcast_to(np.arange(FRAMES) == 0, (64, FRAMES))
-    first, again, other = (np.asarray(step_lib._restarted(is_first, keys(step))) for step in (0, 0, 1))
+    first, again, other = (np.asarray(step_lib._restarted(is_first, keys(step), FRAMES)) for step in (0, 0, 1))
     np.testing.assert_array_equal(first, again)
     assert (first != other).any()
     assert first[:, 0].all() and set(first.sum(axis=1)) == {1, 2}  # nowhere, or at one frame more
     at = np.where(first[:, 1:].any(axis=1), 1 + np.argmax(first[:, 1:], axis=1), 0)
     assert set(at) == set(range(FRAMES))  # the last state has seen from one frame to all of them
-    np.testing.assert_array_equal(first[::-1], step_lib._restarted(is_first, keys(0)[::-1]))
+    np.testing.assert_array_equal(first[::-1], step_lib._restarted(is_first, keys(0)[::-1], FRAMES))
+    seen = np.asarray(step_lib._restarted(is_first, keys(0), SEEN))
+    assert not seen[:, SEEN:].any() and seen[:, SEEN - 1].any()  # what is imagined has no cut
 
 
 def test_cuts_of_a_recording_stay():
     cut = np.broadcast_to(np.arange(FRAMES) % 2 == 0, (64, FRAMES))
-    assert np.asarray(step_lib._restarted(cut, keys(0)))[:, ::2].all()
+    assert np.asarray(step_lib._restarted(cut, keys(0), FRAMES))[:, ::2].all()
+
+
+def test_no_motion_is_learned_across_a_cut():
+    config = dataclasses.replace(
+        presets.get("tiny"), model=dataclasses.replace(presets.get("tiny").model, heads=("ego_motion",)))
+    config = config_lib.override_all(config, {
+        "train.restart": True, "train.observe_frames": SEEN, "train.decode_frames": 0, "data.frames": FRAMES})
+    model = world_model.WorldModel(config.model)
+    shapes = preparation.expected_batch(config, WINDOWS)
+    batch = jax.tree.map(lambda leaf: np.zeros(leaf.shape, leaf.dtype), shapes)
+    batch = dataclasses.replace(batch, is_first=np.broadcast_to(np.arange(FRAMES) == 0, (WINDOWS, FRAMES)))
+    variables = model.init(jax.random.key(0), batch)
+    ours = keys(0, WINDOWS)
+    cut = np.asarray(step_lib._restarted(batch.is_first, ours, SEEN))
+    loss = jax.jit(functools.partial(step_lib.forward, model=model, config=config, train=True, axis_name=None))
+
+    def of(where):
+        moved = np.where(where[..., None], np.float32([1e6, 1e6, 1e6, 0.0]), np.zeros(4, np.float32))
+        _, (terms, _) = loss(variables["params"], variables["batch_stats"],
+                             dataclasses.replace(batch, ego_motion=moved), ours)
+        return float(terms["ego_motion"])
+
+    assert cut[:, 1:].any()
+    assert of(cut) == of(np.zeros_like(cut)) < 1e3 < of(~cut)
 
 
 def config_of(latent):

@@ -277,38 +277,40 @@ def load_run(run: str | os.PathLike, which: int | str = "latest") -> run_lib.Run
     checkpoints = folder / FOLDER
     found = _steps(checkpoints)
     if not found:
-        state = "has no checkpoint yet" if folder.is_dir() else "does not exist"
+        state = ("has no checkpoint yet" if folder.is_dir() else "is a file, and no run's folder" if folder.exists()
+                 else "does not exist")
         raise CheckpointError(f"{folder} {state}; expected {checkpoints}/STEP. Train first: python -m muvo_jax.train.")
-    candidates, note = _candidates(checkpoints, found, which)
-    warnings = [note] if note else []
-    for step in candidates:
+    step, warnings = _readable(checkpoints, found, which)
+    path = checkpoints / str(step)
+    meta = checkpoint_meta.read(path)
+    config = config_lib.Config.from_dict(meta["config"])
+    return run_lib.Run(world_model.WorldModel(config.model), _restore_variables(path / "variables"), config, step,
+                       folder, meta["provenance"], tuple(warnings))
+
+
+def _readable(checkpoints: pathlib.Path, found: list[int], which: int | str) -> tuple[int, list[str]]:
+    """The step that is meant, and what to say of damaged ones that it might have been."""
+    held = ", ".join(map(str, found))
+    if which not in ("latest", "best", *found):
+        raise CheckpointError(f"{checkpoints} has no step {which}; it has {held}.")
+    scores: dict[int, float | None] = {}
+    warnings = []
+    for step in [which] if isinstance(which, int) else found[::-1]:
         path = checkpoints / str(step)
-        reason = integrity.damage(path)
-        if reason is None:
-            meta = checkpoint_meta.read(path)
-            config = config_lib.Config.from_dict(meta["config"])
-            variables = _restore_variables(path / "variables")
-            return run_lib.Run(world_model.WorldModel(config.model), variables, config, step, folder,
-                               meta["provenance"], tuple(warnings))
-        warnings.append(f"checkpoint {path} is damaged: {reason}; trying the one before.")
-    raise CheckpointError(f"no readable checkpoint in {checkpoints}: " + " ".join(warnings))
-
-
-def _candidates(checkpoints: pathlib.Path, found: list[int], which: int | str) -> tuple[list[int], str]:
-    """Steps in the order in which they are tried, and what to say of that; "" for nothing."""
-    newest_first = found[::-1]
-    if which == "latest":
-        return newest_first, ""
-    if which == "best":
-        scores = {step: checkpoint_meta.read(checkpoints / str(step))["score"] for step in newest_first
-                  if integrity.damage(checkpoints / str(step)) is None}
-        scored = {step: score for step, score in scores.items() if score is not None}
-        if not scored:
-            return newest_first, f"no checkpoint in {checkpoints} has a score; the newest is taken for the best."
-        return [max(scored, key=scored.get)], ""  # type: ignore[arg-type]
-    if which not in found:
-        raise CheckpointError(f"{checkpoints} has no step {which}; it has {', '.join(map(str, found))}.")
-    return [int(which)], ""
+        if (reason := integrity.damage(path)) is not None:
+            warnings.append(f"checkpoint {path} is damaged: {reason}; it is passed over.")
+        elif which == "best":
+            scores[step] = checkpoint_meta.read(path)["score"]
+        else:
+            return step, warnings
+    if not scores:
+        wanted = f"of step {which}" if isinstance(which, int) else "at all"
+        raise CheckpointError(f"no readable checkpoint {wanted} in {checkpoints}, which has {held}: "
+                              + " ".join(warnings))
+    scored = {step: score for step, score in scores.items() if score is not None}
+    if not scored:
+        warnings.append(f"no checkpoint in {checkpoints} has a score; the newest is taken for the best.")
+    return max(scored or scores, key=lambda step: scored.get(step, step)), warnings
 
 
 def _score(metrics: Mapping[str, float]) -> float:

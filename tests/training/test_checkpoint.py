@@ -181,6 +181,11 @@ def test_keeps_the_last_and_the_best(tmp_path, fresh, config):
     assert checkpoint.load_run(tmp_path, 4).step == 4
     with pytest.raises(checkpoint.CheckpointError, match="no step 3; it has 2, 4, 5"):
         checkpoint.load_run(tmp_path, 3)
+    _flip_a_byte(tmp_path / "checkpoints" / "2")
+    best = checkpoint.load_run(tmp_path, "best")
+    assert best.step == 5 and "checkpoints/2 is damaged" in best.warnings[0]
+    with pytest.raises(checkpoint.CheckpointError, match=r"no readable checkpoint of step 2 .* 2, 4, 5: .* damaged"):
+        checkpoint.load_run(tmp_path, 2)
 
 
 def test_where_nothing_has_a_score_the_newest_is_said_to_be_the_best(tmp_path, fresh, config):
@@ -207,6 +212,9 @@ def test_loading_what_is_not_there_says_what_was_expected(tmp_path):
         checkpoint.load_run(tmp_path / "nowhere")
     with pytest.raises(checkpoint.CheckpointError, match="has no checkpoint yet"):
         checkpoint.load_run(tmp_path)
+    (tmp_path / "file").touch()
+    with pytest.raises(checkpoint.CheckpointError, match="is a file, and no run's folder"):
+        checkpoint.load_run(tmp_path / "file")
 
 
 def test_an_unknown_schema_names_the_version_that_wrote_it(tmp_path, fresh, config, monkeypatch):

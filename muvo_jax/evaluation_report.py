@@ -96,7 +96,7 @@ def interval_text(metric: Mapping[str, Any], decimals: int) -> str:
 
 
 def answers_line(ratios: Mapping[str, Any]) -> str:
-    """The action shuffle ratios of the heads for the screen."""
+    """The action shuffle ratios of the heads for the screen; there are none of a single window."""
     shown = ", ".join(f"{_error_name(head)} {number(ratio['mean'], 2)}" for head, ratio in ratios.items())
     return f"error under another window's actions over error under the recorded ones (1 is deaf): {shown or 'none'}"
 

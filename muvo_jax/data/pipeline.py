@@ -189,7 +189,7 @@ class EvaluationBatch:
       count: how many of its windows are real; leave the others out of every sum.
       windows: the real windows.
       others: for each window of the batch another one, of another drive where there is one: whose actions a model that
-        answers to actions must not confuse with the window's own.
+        answers to actions must not confuse with the window's own. () where there is one window alone.
     """
 
     batch: types.Batch

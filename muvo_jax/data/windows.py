@@ -84,8 +84,11 @@ def fingerprint(windows: Collection[Window]) -> str:
 
 
 def others(windows: tuple[Window, ...]) -> tuple[Window, ...]:
-    """For each window another one: the first of another drive from half the list on, or what stands there."""
+    """For each window another one: the first of another drive from half the list on, or what stands there; () of a
+    single window, which has no other."""
     count, drives = len(windows), [window.sequence.name for window in windows]
+    if count < 2:
+        return ()
     ends = list(range(2 * count))  # of the stretch of one drive that a place lies in; the list goes round
     for place in range(2 * count - 2, -1, -1):
         if drives[place % count] == drives[(place + 1) % count]:

@@ -94,7 +94,7 @@ def windows(frames: pipeline.Frames, split: str, count: int,
                                              processes=share.processes):
         drives = tuple(window.sequence.name for window in entry.windows)
         scans = [frames.scans(window, frames.config.data.context) for window in entry.windows] if wants_scans else None
-        yield protocol.Windows(entry.batch, drives, frames.actions(entry.others), scans)
+        yield protocol.Windows(entry.batch, drives, frames.actions(entry.others) if entry.others else None, scans)
 
 
 def windows_of_run(run: run_lib.Run | str | os.PathLike, split: str | None = None, *, count: int,

@@ -208,6 +208,7 @@ def test_beside_every_window_stands_one_of_another_drive():
         assert frames.actions(entry.others).shape == entry.batch.action.shape
     alone = pipeline.windows_lib.others(entries[0].windows[:2])
     assert alone == entries[0].windows[1::-1]  # of one drive only: another window of it
+    assert next(pipeline.evaluation_batches(frames, "val", windows=1, batch=4)).others == ()
 
 
 def test_evaluation_of_a_missing_split_fails_at_the_call():
@@ -319,7 +320,7 @@ def test_motion_since_the_frame_before_is_made_of_poses():
         fitting.check_targets(config, blind)
 
 
-@given(st.lists(st.integers(0, 3), min_size=1, max_size=12))
+@given(st.lists(st.integers(0, 3), min_size=2, max_size=12))
 def test_the_other_window_is_the_first_of_another_drive_from_half_the_list_on(drives):
     found = tuple(windows.Window(schema.Sequence("train", f"train/{drive}", index, 5), 0, 2, 1)
                   for index, drive in enumerate(drives))

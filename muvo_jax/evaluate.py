@@ -24,7 +24,7 @@ with late.imports():
     from muvo_jax import head as head_lib
     from muvo_jax import run as run_lib
     from muvo_jax.agents import forecasts
-    from muvo_jax.data import fitting, pipeline, schema, windows
+    from muvo_jax.data import fitting, pipeline, schema, sequences, windows
     from muvo_jax.metrics import baselines, cards, protocol, warp
     from muvo_jax.model import world_model
     from muvo_jax.training import checkpoint_meta, screen, validation
@@ -40,7 +40,7 @@ class Options:
     nothing, and whether what it imagines answers to the actions.
 
     Prints tables and writes RUN/evaluation.json and RUN/report.md (with the name of the card that was asked for, and
-    of the recording where it is another one than the run's). Every table says which protocol card it follows.
+    "on" that of the recording where --data names one). Every table says which protocol card it follows.
     """
 
     run: Annotated[pathlib.Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
@@ -101,7 +101,8 @@ def evaluate(options: Options, show: screen.Screen) -> dict[str, Any]:
     if card and (problem := card.foreign(config, recording.description.kind)):
         raise ValueError(problem)
     frames = pipeline.Frames(recording, config)
-    mean, mean_frames = validation.training_mean(frames) if "train" in recording.description.splits else ({}, 0)
+    trained = sequences.longest(recording.sequences, "train", frames.needs) > 0  # who judges may have copied no more
+    mean, mean_frames = validation.training_mean(frames) if trained else ({}, 0)
     report: dict[str, Any] = {
         "run": str(loaded.folder), "variant": config.model.variant, "step": loaded.step,
         "parameters": sum(leaf.size for leaf in jax.tree.leaves(loaded.variables["params"])),
@@ -130,7 +131,7 @@ def evaluate(options: Options, show: screen.Screen) -> dict[str, Any]:
             show.console.print(evaluation_report.screen_table(split, phase, scores))
         show.line(evaluation_report.answers_line(scores["action_shuffle"]))
     suffix = f"-{pathlib.Path(card.name).stem}" if card else ""
-    suffix += f"-{_in_a_name(recording.description.name)}" if options.data else ""
+    suffix += f"-on-{_in_a_name(recording.description.name, config.data.path)}" if options.data else ""
     written = evaluation_report.write_report(loaded.folder, report, suffix)
     if options.uncertainty:
         written += (evaluation_report.draw_uncertainty(loaded.folder / f"uncertainty{suffix}.png", report),)
@@ -162,12 +163,12 @@ def log_windows(log: rerun_log.RerunLog, config: config_lib.Config, split: str, 
                poses=warp.path(item.batch, context, config), name=split)
 
 
-def _in_a_name(text: str) -> str:
-    """A recording's name as a part of a file's: KITTI's are those of all its drives, other ones have slashes."""
-    plain = re.sub(r"[^\w.-]+", "-", text)
-    if plain == text and len(text) <= 60:
-        return text
-    return f"{plain[:40]}-{hashlib.sha256(text.encode()).hexdigest()[:8]}"
+def _in_a_name(name: str, path: str) -> str:
+    """A recording as a part of a file's name. Copies of one have one name, KITTI's are those of all its drives, other
+    ones have slashes: so its beginning, and where the recording lies as eight digits."""
+    where = path if path == "town" else str(pathlib.Path(path).expanduser().resolve())
+    plain = re.sub(r"[^\w.-]+", "-", name)[:40]
+    return f"{plain}-{hashlib.sha256(where.encode()).hexdigest()[:8]}"
 
 
 def _splits(card: cards.Card | None, recording: schema.Recording) -> tuple[str, ...]:

@@ -2,6 +2,7 @@
 
 import json
 import resource
+import shutil
 import time
 
 import jax
@@ -170,6 +171,14 @@ def test_a_converted_run_is_judged_dreams_and_trains_on(tmp_path, monkeypatch):
     judged = evaluate.evaluate(evaluate.Options(tmp_path / "run", splits=("val_rl",), windows=1, batch=1),
                                screen.Screen())
     assert "val_rl" in json.dumps(judged) and (tmp_path / "run" / "evaluation.json").exists()
+    town = next((tmp_path / "cache" / "muvo_jax").glob("town-tiny-*"))
+    shutil.copytree(town, tmp_path / "copied", ignore=shutil.ignore_patterns("train"))  # what is judged, and no more
+    again = evaluate.evaluate(evaluate.Options(tmp_path / "run", splits=("val_rl",), windows=1, batch=1,
+                                               data=str(tmp_path / "copied")), screen.Screen())
+    scores = judged["splits"]["val_rl"]["imagined"], again["splits"]["val_rl"]["imagined"]
+    assert json.dumps(scores[0]["model"]) == json.dumps(scores[1]["model"])  # NaN and all
+    assert scores[0].keys() - scores[1].keys() == {"training_mean"}
+    assert judged["splits"]["val_rl"]["action_shuffle"] == {}  # a single window has no other one's actions
     drawn = dream.dream(dream.Options(tmp_path / "run", context=2, horizon=2), screen.Screen())
     assert {path.suffix for path in drawn} == {".gif", ".png", ".html"} and all(path.stat().st_size for path in drawn)
     train.train(train.Options(preset="tiny", init=tmp_path / "run", name="more", runs_dir=tmp_path, steps=1, batch=1,

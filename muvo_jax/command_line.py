@@ -10,6 +10,7 @@ import dataclasses
 import difflib
 import inspect
 import json
+import math
 import os
 import pathlib
 import sys
@@ -69,7 +70,7 @@ def run(options_type: type[_Options], work: Callable[[_Options, screen.Screen], 
     description = "\n\n".join(paragraphs)  # the help joins lines, but not paragraphs
     called = sys.argv[0] if sys.argv[0].startswith("muvo ") else f"python -m muvo_jax.{program}"
     with reader_may_leave():
-        options = tyro.cli(options_type, prog=called, args=given, description=description)
+        options = at_home(tyro.cli(options_type, prog=called, args=given, description=description))
     check_numbers(options)
     if trains and arguments is None:
         host.restart_with_huge_pages()
@@ -143,7 +144,8 @@ def check_options(options_type: type, program: str, arguments: Sequence[str]) ->
 def gathered(options_type: type, arguments: Sequence[str]) -> list[str]:
     """The arguments with options that take many values once each: --set A=1 --set B=2 means both, and the parser would
     take the last one alone."""
-    many = {f"--{field.name.replace('_', '-')}" for field in dataclasses.fields(options_type) if field.default == ()}
+    many = {f"--{field.name.replace('_', '-')}" for field in dataclasses.fields(options_type)
+            if isinstance(field.default, tuple)}
     named = [argument.partition("=")[0] for argument in arguments if argument.startswith("--")]
     rest: list[str] = []
     values: dict[str, list[str]] = {name: [] for name in many if named.count(name) > 1}
@@ -159,13 +161,21 @@ def gathered(options_type: type, arguments: Sequence[str]) -> list[str]:
     return rest + [word for name, words in values.items() for word in (name, *words)]
 
 
+def at_home(options: _Options) -> _Options:
+    """The options with their paths' ~ expanded, which a shell leaves alone in --out=~/runs."""
+    paths = {field.name: pathlib.Path(os.path.expanduser(value)) for field in dataclasses.fields(options)  # type: ignore
+             if isinstance(value := getattr(options, field.name), pathlib.Path)}
+    return dataclasses.replace(options, **paths)  # type: ignore[type-var]
+
+
 def check_numbers(options: Any) -> None:
-    """Ends with exit code 2 at a number that no option takes: a negative one, or no worker at all."""
+    """Ends with exit code 2 at a number that no option takes: a negative or endless one, or no worker at all."""
     for field in dataclasses.fields(options):
         value = getattr(options, field.name)
         least = int(field.name == "workers")
-        if isinstance(value, int | float) and not value >= least:
-            print(f"error: --{field.name.replace('_', '-')} is {value}; expected {least} or more", file=sys.stderr)
+        if isinstance(value, int | float) and not least <= value < math.inf:
+            print(f"error: --{field.name.replace('_', '-')} is {value}; expected {least} or more, and finite",
+                  file=sys.stderr)
             raise SystemExit(2)
 
 

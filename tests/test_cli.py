@@ -15,7 +15,7 @@ import pytest
 
 import muvo_jax
 from muvo_jax import __main__ as listing
-from muvo_jax import command_line, evaluate, evaluation_report, presets, train
+from muvo_jax import command_line, drive, evaluate, evaluation_report, presets, record_carla, train
 from muvo_jax import config as config_lib
 from muvo_jax.data import words
 from muvo_jax.training import host, run_folder, screen
@@ -123,14 +123,23 @@ def test_only_training_starts_the_process_anew_and_only_once_the_flags_are_right
     ("train", "--steps=-1"), ("train", "--workers=0"), ("doctor", "--frames=-1"), ("dream", "--branches=-2"),
     ("drive", "--episodes=-1"), ("drive", "--seconds=-1"), ("record_carla", "--vehicles=-1"),
     ("pack", "--frames-per-shard=-5"), ("pack", "--workers=-1"), ("voxelize", "--workers=0"),
-    ("evaluate", "--windows=-1")])
+    ("evaluate", "--windows=-1"), ("estimate", "--memory-gib=inf"), ("drive", "--seconds=nan")])
 def test_a_count_below_zero_is_a_wrong_command_line(command, option, capsys, monkeypatch):
-    positional = {"pack": ["a", "b"]}.get(command, [] if command == "train" else ["a"])
+    positional = {"pack": ["a", "b"]}.get(command, [] if command in ("train", "estimate") else ["a"])
     monkeypatch.setattr(sys, "argv", ["muvo", *positional, option])
     with pytest.raises(SystemExit) as ended:
         _module(command).main()
     flag, _, value = option.partition("=")
     assert ended.value.code == 2 and f"{flag} is {float(value):g}" in capsys.readouterr().err.replace(".0", "")
+
+
+def test_a_path_may_begin_at_home(monkeypatch, tmp_path):
+    monkeypatch.setenv("HOME", str(tmp_path))
+    given = []
+    arguments = ["~/run", "--out=~/there", "--policy", "~nobody-of-that-name/agent"]
+    command_line.run(drive.Options, lambda options, show: given.append(options), program="drive", arguments=arguments)
+    assert (given[0].run, given[0].out) == (tmp_path / "run", tmp_path / "there")
+    assert given[0].policy == pathlib.Path("~nobody-of-that-name/agent")
 
 
 def test_work_goes_on_when_the_reader_of_its_lines_leaves(monkeypatch, capfd):
@@ -218,6 +227,13 @@ def test_set_may_be_given_again_and_again():
                       ["--name=run", "--set", "a.b=1", "c=2", "d=x=y", "c=3"]):
         command_line.run(train.Options, lambda options, _: given.append(options), program="train", arguments=arguments)
     assert given[0] == given[1] and given[0].set == ("a.b=1", "c=2", "d=x=y", "c=3")
+
+
+def test_what_has_many_values_by_default_may_be_given_again_and_again():
+    given = []
+    command_line.run(record_carla.Options, lambda options, _: given.append(options), program="record_carla",
+                     arguments=["out", "--towns", "Town01", "--towns=Town02"])
+    assert given[0].towns == ("Town01", "Town02")
 
 
 def test_default_names_tell_runs_apart():

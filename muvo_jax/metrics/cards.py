@@ -126,12 +126,12 @@ def load(name: str) -> Card:
       ValueError: for an unknown name (naming the nearest), a file that is no card, or one of another protocol version.
       OSError: where the file cannot be read.
     """
-    path = pathlib.Path(name)
+    path = pathlib.Path(name).expanduser()
     if path.suffix != ".toml":
         config_lib.check_choice("card", name, known())
         path = FOLDER / f"{name}.toml"
     try:
-        values = {"name": name, **tomllib.loads(path.read_text(encoding="utf-8"))}
+        values = {"name": name, **tomllib.loads(path.read_text(encoding="utf-8-sig"))}
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise ValueError(f"{path}: not TOML: {error}") from error
     card = config_lib.parse(Card, values, str(path))

@@ -161,7 +161,7 @@ def read_config(path: str | os.PathLike) -> config_lib.Config:
     """
     source = pathlib.Path(path).expanduser() / CONFIG_FILE
     try:
-        return config_lib.Config.from_dict(json.loads(source.read_text(encoding="utf-8")))
+        return config_lib.Config.from_dict(json.loads(source.read_text(encoding="utf-8-sig")))
     except FileNotFoundError as error:
         raise FileNotFoundError(f"{source} is missing, so there is no run to go on with in {path}. "
                                 f"Leave --resume away to start one.") from error

@@ -81,6 +81,12 @@ def test_what_a_card_cannot_do_is_refused(town, tmp_path):
             cards.load(str(own))
 
 
+def test_a_card_may_lie_at_home_and_begin_with_a_byte_order_mark(monkeypatch, tmp_path):
+    monkeypatch.setenv("HOME", str(tmp_path))
+    (tmp_path / "own.toml").write_text(f'protocol = "{protocol.VERSION}"\n', encoding="utf-8-sig")
+    assert cards.load("~/own.toml").protocol == protocol.VERSION
+
+
 def test_scores_that_a_card_does_not_define_do_not_go_under_its_name():
     scores = {"windows": 2, "observed": {"model": {"psnr_db": 1, "chamfer_m": 2}},
               "imagined": {"model": {"chamfer_m": 3}}}

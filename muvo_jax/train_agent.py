@@ -35,7 +35,7 @@ with late.imports():
     from muvo_jax.training import checkpoint_meta, screen, validation
     from muvo_jax.viz import curves
 
-TUNING_SEED = 7_000  # of the drives that are judged on the way: neither recorded nor those of drive
+TUNING_SEED = 4_000  # of the drives that are judged on the way: neither recorded nor, from 5,000 on, those of drive
 OBSERVED_AT_ONCE = 64  # windows
 POOL_ROUNDS = 6  # so many rounds' futures are driven again
 HORIZON = 12  # steps of a future: as far as the memory foresees what moves

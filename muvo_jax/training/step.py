@@ -60,8 +60,9 @@ def make_train_step(model: world_model.WorldModel, config: config_lib.Config, *,
                     frozen: perceptual.FrozenEncoder | None = None) -> SpreadFunction:
     """Builds function(state, batch) -> (state, metrics); the state that goes in is donated.
 
-    The metrics are float32 scalars: every loss term (unweighted), "total", "psnr_db" of the observed images,
-    "learning_rate", the norms "gradient_norm", "parameter_norm", "update_norm" of what trains, and "finite" (1 or 0).
+    The metrics are float32 scalars: every loss term (unweighted), "total", "psnr_db" of the decoded images
+    (imagined ones among them where config.train.observe_frames leaves some), "learning_rate", the norms
+    "gradient_norm", "parameter_norm", "update_norm" of what trains, and "finite" (1 or 0).
     An update that is not finite is not applied, so the parameters stay usable (its "update_norm" is 0, its rate that of
     the update before); the step is counted.
 

@@ -3,7 +3,8 @@
     python -m experiments.memory.ranges RUN [WINDOWS]
 
 "the model's returns at the memory's ranges" asks the model only which pixels return; "but those that doubt the memory"
-leaves out its returns that are more than DOUBT_M from the memory's.
+leaves out its returns that are more than DOUBT_M from the memory's. The truth beside itself says what the measure costs,
+which draws other points of each.
 """
 
 import sys
@@ -60,7 +61,8 @@ def main(path: str = "builtin:town", windows: str = "16") -> None:
             guess = protocol.predict(run.model, run.variables, jax.random.key(0), entry.batch, context=context,
                                      horizon=horizon, sampled=False)["range_view"][:, context:]
             seen = (np.asarray(value).reshape(truth.shape[:-1]) for value in jax.device_get(look(entry.batch)))
-            for name, view in mixtures(np.asarray(guess), *seen, threshold_m, config.model.range_view).items():
+            views = mixtures(np.asarray(guess), *seen, threshold_m, config.model.range_view)
+            for name, view in (views | {"the truth itself": truth}).items():
                 found.setdefault(name, []).append(np.stack([points.frame_chamfer_m(
                     view, truth, return_threshold_m=threshold_m, points=config.evaluation.chamfer_points,
                     seed=(0, number), above_m=above_m) for above_m in (-np.inf, occupancy.ABOVE_ROAD_M)]))

@@ -185,7 +185,7 @@ def _named(folders: list[pathlib.Path], path: pathlib.Path) -> dict[str, pathlib
     """Name -> folder; of a drive and a link to it the one beside which its calibration lies.
 
     Raises:
-      DataError: where two folders are of one drive.
+      DataError: where two folders are of one drive, or two drives are one folder.
     """
     found: dict[str, pathlib.Path] = {}
     for folder in folders:
@@ -196,6 +196,10 @@ def _named(folders: list[pathlib.Path], path: pathlib.Path) -> dict[str, pathlib
                                    f"read the folders one by one.")
         if not _has_calibration(_date_folder(other)):
             found[name] = folder
+    # A drive that tests, linked to one that trains, would be judged on what was trained.
+    if twice := sequences.named_twice((folder.resolve(), name) for name, folder in found.items()):
+        target, one, another = twice
+        raise schema.DataError(f"{path}: drives {one} and {another} are one folder, {target}. Remove one of the links.")
     return found
 
 

@@ -240,11 +240,16 @@ def read_sensors(path: pathlib.Path) -> tuple[dict, pathlib.Path]:
 
 
 def _check_names(every: list[muvo_runs.Run], path: pathlib.Path) -> None:
-    """Raises DataError where two runs have one name, such as those of two recordings in one folder."""
+    """Raises DataError where two runs have one name, such as those of two recordings in one folder, or are one."""
     if twice := sequences.named_twice((run.name, run.folder) for run in every):
         name, one, other = twice
         raise schema.DataError(f"{path}: {one} and {other} are both run {name}. Read the recordings one by one, or "
                                f"rename one of the folders.")
+    # A mode linked to another one would be judged on what was trained.
+    if linked := sequences.named_twice((run.folder.resolve(), run.name) for run in every):
+        folder, one_name, other_name = linked
+        raise schema.DataError(f"{path}: {one_name} and {other_name} are one folder, {folder}. Remove one of the "
+                               f"links.")
 
 
 def _is_carved(kept: list[muvo_runs.Run]) -> bool:

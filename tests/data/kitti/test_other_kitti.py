@@ -86,6 +86,8 @@ def test_linked_drives_are_named_as_they_are_called_here(tmp_path):
     tested = sources.open_recording(date / "2011_09_30_drive_0033_sync")
     assert [(sequence.split, sequence.name) for sequence in tested.sequences] == [
         ("test", "2011_09_30_drive_0033_sync")]
+    with pytest.raises(schema.DataError, match=r"drives 2011_09_26_\S+ and 2011_09_30_\S+ are one"):
+        sources.open_recording(date)
 
 
 def test_a_link_to_a_drive_may_be_called_otherwise(tmp_path):

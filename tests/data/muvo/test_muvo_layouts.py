@@ -250,6 +250,16 @@ def test_a_link_to_a_mode_is_that_mode_by_its_name_or_its_target(tmp_path):
     assert sources.open_recording(tmp_path / "val1").description.splits == ("val1",)
 
 
+@pytest.mark.parametrize(("link", "target", "name"), [("val0", "train", "val0/Town01/0000"),
+                                                      ("train/Town01/0001", "0000", "train/Town01/0001")])
+def test_one_folder_under_two_modes_or_names_is_refused(tmp_path, link, target, name):
+    trainval = layout(tmp_path) / "trainval"
+    shutil.rmtree(trainval / "val0")
+    (trainval / link).symlink_to(target)
+    with pytest.raises(schema.DataError, match=f"train/Town01/0000 and {name} are one folder, "):
+        sources.open_recording(tmp_path)
+
+
 def test_two_runs_of_one_name_are_refused(tmp_path):
     for name in ("monday", "tuesday"):
         write_run(tmp_path / name / "train/Town01/0000")

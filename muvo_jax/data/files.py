@@ -266,6 +266,15 @@ def finite_points(points_m: np.ndarray, path: pathlib.Path) -> np.ndarray:
     return points_m[finite]
 
 
+def check_written(rows: np.ndarray, path: pathlib.Path, most: float = BAD_POINT_SHARE) -> None:
+    """Raises DataError where a larger share than `most` of a scan's rows [N, C] holds nothing but zeros, which is what
+    was never written of a file."""
+    empty = int((~rows.any(axis=1)).sum())
+    if empty > most * len(rows):
+        raise schema.DataError(f"{path}: {empty} of {len(rows)} points are 0 in all their numbers: the file is written "
+                               f"or copied in part. Copy it again, or delete it so that the sequence is split there.")
+
+
 def numbered(folder: pathlib.Path, suffixes: str | Sequence[str]) -> dict[int, str]:
     """The files of frames in a folder, frame number -> name: 12.png, 000012.png and 000012.PNG are all frame 12.
 

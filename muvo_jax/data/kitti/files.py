@@ -7,7 +7,7 @@ import pathlib
 
 import numpy as np
 
-from muvo_jax.data import fields, files, schema
+from muvo_jax.data import fields, files, schema, sequences
 from muvo_jax.limits import between
 
 LIDAR_HEIGHT_M = 1.73
@@ -32,8 +32,8 @@ def read_scan(path: pathlib.Path) -> np.ndarray:
     """Returns one velodyne scan as points float32 [N, 3] in the ego frame (reflectance is not used).
 
     Raises:
-      DataError: for a missing, unreadable or empty file, a size that is no multiple of 16 bytes, or more than 1 % NaN
-        points.
+      DataError: for a missing, unreadable or empty file, a size that is no multiple of 16 bytes, or more than 1 % of
+        the points NaN or nothing but zeros.
     """
     content = files.read_bytes(path, "a velodyne scan")
     if not content or len(content) % 16:
@@ -41,6 +41,7 @@ def read_scan(path: pathlib.Path) -> np.ndarray:
                                f"(float32 x, y, z, reflectance). The file is truncated or no scan: copy it again, or "
                                f"delete it so that the sequence is split there.")
     rows = np.frombuffer(content, np.float32).reshape(-1, 4)
+    files.check_written(rows, path)
     points_m = files.finite_points(rows[:, :3], path)
     reflectance = rows[:, 3]
     if np.mean((reflectance < 0) | (reflectance > 1)) > _REFLECTANCE_SHARE:
@@ -85,7 +86,7 @@ def _oxts_values(path: pathlib.Path) -> list[float]:
         values = [float(word) for word in content.decode("utf-8-sig").split()]
     except ValueError as error:
         raise schema.DataError(f"{path}: not a line of numbers ({error}).") from error
-    if len(values) < _OXTS_COLUMNS or not all(map(math.isfinite, values)):
+    if len(values) != _OXTS_COLUMNS or not all(map(math.isfinite, values)):
         raise schema.DataError(f"{path}: {len(values)} values, expected {_OXTS_COLUMNS} finite numbers (see "
                                f"dataformat.txt of KITTI). Unpack the oxts data of this drive again.")
     for column, (name, limits) in _OXTS_LIMITS.items():
@@ -102,7 +103,7 @@ def read_camera(date_folder: pathlib.Path, number: str) -> schema.Camera:
     which is K times the shift along the baseline).
 
     Raises:
-      DataError: where a calibration file or a key is missing.
+      DataError: where a calibration file or a key is missing, or a key is there twice with different numbers.
     """
     of_cameras, of_lidar = (date_folder / name for name in CALIBRATION)
     cameras = _read_calibration(of_cameras, {f"P_rect_{number}": 12, "R_rect_00": 9, f"S_rect_{number}": 2})
@@ -135,7 +136,12 @@ def _rigid(rotation: np.ndarray, translation: np.ndarray) -> np.ndarray:
 
 def _read_calibration(path: pathlib.Path, sizes: dict[str, int]) -> dict[str, np.ndarray]:
     text = text_lines(path, "the calibration of this date (KITTI offers it as a separate download)")
-    lines = dict(line.split(":", 1) for line in text if ":" in line)
+    pairs = [(key, value.strip()) for key, _, value in (line.partition(":") for line in text if ":" in line)]
+    if twice := sequences.named_twice(pair for pair in pairs if pair[0] in sizes):
+        key, one, other = twice
+        raise schema.DataError(f"{path}: \"{key}:\" is there twice, as {one} and as {other}. Remove the wrong line, or "
+                               f"unpack the calibration of this date again.")
+    lines = dict(pairs)
     values = {}
     for key, size in sizes.items():
         try:

@@ -25,7 +25,7 @@ def read_scan(path: pathlib.Path, lidar_to_ego: np.ndarray) -> np.ndarray:
 
     Raises:
       DataError: for a missing, unreadable or empty file, a size that is no multiple of 20 bytes, more than 1 % NaN
-        points, or numbers that are no intensities and beams.
+        points, more rows of nothing but zeros than one beam has, or numbers that are no intensities and beams.
     """
     content = files.read_bytes(path, "a scan of LIDAR_TOP")
     if not content or len(content) % _ROW_BYTES:
@@ -33,6 +33,8 @@ def read_scan(path: pathlib.Path, lidar_to_ego: np.ndarray) -> np.ndarray:
                                f"{_ROW_BYTES} bytes (float32 x, y, z, intensity, beam). The file is truncated or no "
                                f"scan: copy it again, or delete it so that the sequence is split there.")
     rows = np.frombuffer(content, np.float32).reshape(-1, _COLUMNS)
+    # What does not return lies at the lidar itself, with the number of its beam: such rows of zeros are beam 0's alone.
+    files.check_written(rows, path, most=1 / BEAMS)
     intensity, beam = rows[:, 3], rows[:, 4]
     for name, values, is_sound, expected in (
             ("intensities", intensity, (intensity >= 0) & (intensity <= _INTENSITY_END), f"0 to {_INTENSITY_END}"),

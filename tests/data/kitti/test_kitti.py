@@ -229,6 +229,8 @@ GOOD, BAD = (5.0, 1.0, 0.0, 0.0), (float("nan"), 1.0, 0.0, 0.0)
     (remove("oxts/data"), "0000000000.txt is missing .*the oxts frames"),
     (remove("../calib_velo_to_cam.txt"), "calib_velo_to_cam.txt is missing.*calibration"),
     (break_file("../calib_cam_to_cam.txt", lambda c: c.replace(b"P_rect_02", b"P_rect_07")), "\"P_rect_02:\" with 12"),
+    (break_file("../calib_velo_to_cam.txt", lambda c: c + b"T: 0 -0.08 -0.9\n"),
+     "calib_velo_to_cam.txt: \"T:\" is there twice, as 0 -0.08 -0.3 and as 0 -0.08 -0.9"),
 ])
 def test_a_drive_that_cannot_be_opened(drive, damage, message):
     damage(drive)
@@ -242,7 +244,11 @@ def test_a_drive_that_cannot_be_opened(drive, damage, message):
     (break_file("velodyne_points/data/0000000000.bin", lambda c: c[:-3]), r"3197 bytes; .*multiple of 16"),
     (break_file("velodyne_points/data/0000000000.bin", lambda c: b""), r"0 bytes; .*multiple of 16"),
     (break_file("velodyne_points/data/0000000000.bin", points(GOOD, BAD)), "1 of 2 points are NaN"),
+    (break_file("velodyne_points/data/0000000000.bin", lambda c: c[:1600] + bytes(1600)),
+     "0000000000.bin: 100 of 200 points are 0 in all their numbers: .* in part"),
     (break_file("oxts/data/0000000000.txt", lambda c: b"1 2 3"), "0000000000.txt: 3 values, expected 30"),
+    (break_file("oxts/data/0000000000.txt", lambda c: b"3 " + c), "0000000000.txt: 31 values, expected 30"),
+    (break_file("oxts/data/0000000000.txt", lambda c: c + b"\n" + c), "0000000000.txt: 60 values, expected 30"),
     (break_file("oxts/data/0000000000.txt", lambda c: b"north"), "0000000000.txt: not a line of numbers"),
     (break_file("../calib_cam_to_cam.txt", lambda c: c.replace(b"1.280000e+02", b"6.4e+01")), "128x48 pixels.*64x48"),
 ])

@@ -359,6 +359,16 @@ def test_returns_of_the_own_car_are_left_out(root):
     np.testing.assert_allclose(scans.read_scan(path, writer.sensor_to_ego("LIDAR_TOP", 0)), [[5.94, 0, 0]], atol=1e-6)
 
 
+def test_what_does_not_return_lies_at_the_lidar_and_is_left_out(root):
+    """Such rows have the number of their beam, so that only those of beam 0 are zeros throughout."""
+    path = next((root / "samples/LIDAR_TOP").iterdir())
+    rows = np.zeros((64, 5), np.float32)
+    rows[:, 4] = np.arange(64) % 32
+    rows[16:, 1] = 5.0
+    rows.tofile(path)
+    assert len(scans.read_scan(path, writer.sensor_to_ego("LIDAR_TOP", 0))) == 48
+
+
 @pytest.mark.parametrize(("rows", "message"), [
     (np.zeros((3, 4), np.float32), r"48 bytes; a scan of nuScenes is a positive multiple of 20"),
     (np.zeros((0, 5), np.float32), "0 bytes; a scan of nuScenes"),
@@ -366,6 +376,8 @@ def test_returns_of_the_own_car_are_left_out(root):
     (np.array([[5, 1, 0, 3, 64]], np.float32), "its beams reach from 64 to 64"),
     (np.array([[5, 1, 0, -1, 3]], np.float32), "its intensities reach from -1 to -1, expected 0 to 255"),
     (np.array([[5, np.nan, 0, 9, 3]], np.float32), "1 of 1 points are NaN"),
+    (np.repeat(np.array([[5, 1, 0, 9, 3], [0] * 5], np.float32), (60, 4), axis=0),
+     "4 of 64 points are 0 in all their numbers: .* in part"),
     (np.array([[5e6, 0, 0, 9, 3]], np.float32), "points_m has 1 of 3 values such as 5000000"),
 ])
 def test_a_scan_that_is_none_is_refused(root, rows, message):

@@ -13,8 +13,8 @@ from muvo_jax import config as config_lib
 from muvo_jax.data import description as description_lib
 from muvo_jax.data import fields, files, schema
 
-SCHEMA_VERSION = 2  # 1 had no recorded bytes of pictures in its records
-_READABLE_VERSIONS = (1, SCHEMA_VERSION)
+SCHEMA_VERSION = 3  # 2 did not say in its records which frame they are; 1 had no recorded bytes of pictures either
+_READABLE_VERSIONS = (1, 2, SCHEMA_VERSION)
 MANIFEST_FILE = "manifest.json"
 FRAMES_PER_SHARD = 256  # where nothing else is said
 # What values that are anything at all can lead to.
@@ -58,6 +58,9 @@ def _manifest_fault(manifest: dict) -> str | None:
         for number, entry in enumerate(entries):
             if said := fault(entry):
                 return f"{name}[{number}]: {said}"
+    for number, shard in enumerate(shards):
+        if shard["file"] != shard_name(number):
+            return f"shards[{number}]: file is {shard['file'][:80]}, expected {shard_name(number)}"
     total = sum(sequence["length"] for sequence in sequences)
     frames = [min(per_shard, total - number * per_shard) for number in range(len(shards))]
     if [shard["frames"] for shard in shards] != frames or sum(frames) != total:
@@ -67,13 +70,17 @@ def _manifest_fault(manifest: dict) -> str | None:
     return "two sequences of one run begin at one frame" if len(set(starts)) < len(starts) else None
 
 
+def shard_name(number: int) -> str:
+    """The file of a shard."""
+    return f"shard-{number:05d}.arrayrecord"
+
+
 def entry_fault(entry: Any) -> str | None:
     """What is wrong with what a shard says about itself; None where it can be used."""
     if not isinstance(entry, dict):
         return "no table"
-    name = entry.get("file")
-    if not isinstance(name, str) or pathlib.PurePosixPath(name).name != name or "\0" in name or "\\" in name:
-        return f"file is {str(name)[:80]!r}, expected the name of a file"
+    if not isinstance(entry.get("file"), str):
+        return f"file is {str(entry.get('file'))[:80]}, expected the name of a file"
     for field in ("frames", "bytes"):
         if not is_count(entry.get(field), least=1):
             return f"{field} is {str(entry.get(field))[:80]}, expected a whole number of 1 or more"

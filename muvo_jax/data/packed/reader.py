@@ -37,9 +37,9 @@ class PackedRecording:
 
         Args:
           labels: which of schema.LABELS the frames should have, where they are packed.
-          corrupt: "raise" compares sizes now and checksums of frames as they are read, and stops at the first that is
-            wrong; "skip" compares the checksums of all shards now (one pass over the data) and leaves the frames of
-            damaged ones out, with a warning that names and counts them.
+          corrupt: "raise" compares sizes now, and of frames as they are read checksums and which frame it is, and
+            stops at the first that is wrong; "skip" compares the checksums of all shards now (one pass over the data)
+            and leaves the frames of damaged ones out, with a warning that names and counts them.
 
         Raises:
           DataError: for an incomplete or malformed manifest, or a shard that is missing or damaged.
@@ -126,7 +126,8 @@ class PackedRecording:
                 (record,) = self._reader(shard).read([position])
         except (RuntimeError, IndexError, ValueError) as error:
             raise records.damaged(where, str(error)) from error
-        frame = records.decode_frame(record, where, only)
+        place = records.place_of(sequence.name, sequence.start + index)
+        frame = records.decode_frame(record, where, only, place)
         for name in self._unwanted & frame.keys():
             del frame[name]  # type: ignore[misc]
         camera = self.description.camera

@@ -1,7 +1,7 @@
 """A frame as the bytes of one record of a packed recording, and back.
 
-A length-prefixed JSON header names the fields (dtype, shape, encoding, size), their bytes follow and a CRC-32 of all of
-it closes the record. Nothing is pickled.
+A length-prefixed JSON header says which frame it is and names the fields (dtype, shape, encoding, size), their bytes
+follow and a CRC-32 of all of it closes the record. Nothing is pickled.
 """
 
 from __future__ import annotations
@@ -46,37 +46,45 @@ class Encoding:
             raise ValueError(f"jpeg_quality is {self.jpeg_quality}, expected 1 to 95, or None for PNG.")
 
 
-def encode_frame(frame: schema.RawFrame, encoding: Encoding, recorded: Sequence[files.Picture] = ()) -> bytes:
+def place_of(run: str, row: int) -> str:
+    """Which frame a record is: that of a row of a run."""
+    return f"row {row} of run {run}"
+
+
+def encode_frame(frame: schema.RawFrame, encoding: Encoding, recorded: Sequence[files.Picture] = (),
+                 place: str = "") -> bytes:
     """One frame as one record.
 
     Args:
       recorded: pictures that were read for it: a field that is the pixels of one of them is kept as its bytes.
+      place: see `place_of`; kept in the record.
     """
     contents = {id(picture.pixels): picture for picture in recorded}
-    header, parts = [], []
+    described, parts = [], []
     for name, value in frame.items():
         array = np.asarray(value)
         if array.dtype.hasobject:
             raise ValueError(f"{name}: arrays of objects are not stored.")
         kind, content = _encode(name, array, encoding, contents.get(id(array)))
-        header.append({"name": name, "dtype": array.dtype.str, "shape": list(array.shape), "encoding": kind,
-                       "bytes": len(content)})
+        described.append({"name": name, "dtype": array.dtype.str, "shape": list(array.shape), "encoding": kind,
+                          "bytes": len(content)})
         parts.append(content)
-    text = json.dumps(header).encode()
+    text = json.dumps({"place": place, "fields": described}).encode()
     body = b"".join((_LENGTH.pack(len(text)), text, *parts))
     return body + _LENGTH.pack(zlib.crc32(body))
 
 
-def decode_frame(record: bytes, where: str, only: Collection[str] | None = None) -> schema.RawFrame:
+def decode_frame(record: bytes, where: str, only: Collection[str] | None = None, place: str = "") -> schema.RawFrame:
     """The inverse of `encode_frame`.
 
     Args:
       record: the bytes.
       where: they lie, for messages.
       only: the fields that are wanted; None is all.
+      place: of the frame that is wanted; records from before SCHEMA_VERSION 3 do not say theirs.
 
     Raises:
-      DataError: for a damaged record.
+      DataError: for a damaged record, or one of another frame.
     """
     if len(record) < 2 * _LENGTH.size or zlib.crc32(record[:-4]) != _LENGTH.unpack(record[-4:])[0]:
         raise damaged(where, "its checksum does not fit")
@@ -84,7 +92,12 @@ def decode_frame(record: bytes, where: str, only: Collection[str] | None = None)
     frame: dict[str, Any] = {}
     position = _LENGTH.size + size
     try:
-        for field in json.loads(record[_LENGTH.size:position]):
+        header = json.loads(record[_LENGTH.size:position])
+        if isinstance(header, dict):
+            if header["place"] != place:
+                raise ValueError(f"it is {str(header['place'])[:80]}, not {place}: were shards exchanged?")
+            header = header["fields"]
+        for field in header:
             content = record[position:position + field["bytes"]]
             position += field["bytes"]
             if only is not None and field["name"] not in only:

@@ -95,7 +95,7 @@ def pack(source: pathlib.Path | str, out: pathlib.Path | str, *, encoding: recor
 def write_shard(recording: schema.Recording, out: pathlib.Path, encoding: records.Encoding,
                 shard: Shard) -> Iterator[int]:
     """Writes one shard, frame by frame; yields its number after each frame."""
-    path = out / _name(shard.number)
+    path = out / manifest.shard_name(shard.number)
     draft = path.with_name(f".{path.name}.draft")
     path.with_suffix(".json").unlink(missing_ok=True)
     writer = array_record_module.ArrayRecordWriter(str(draft), "group_size:1,uncompressed")
@@ -104,7 +104,8 @@ def write_shard(recording: schema.Recording, out: pathlib.Path, encoding: record
             for index in range(start, stop):
                 with files.keeping_pictures() as pictures:
                     frame = recording.read(sequence, index)
-                writer.write(records.encode_frame(frame, encoding, pictures))
+                place = records.place_of(sequence.name, sequence.start + index)
+                writer.write(records.encode_frame(frame, encoding, pictures, place))
                 yield shard.number
     finally:
         writer.close()
@@ -197,20 +198,17 @@ def _shards(recording: schema.Recording, source: pathlib.Path, frames_per_shard:
          for sequence, start, stop in parts])) for number, parts in enumerate(groups)]
 
 
-def _name(number: int) -> str:
-    return f"shard-{number:05d}.arrayrecord"
-
-
 def _entry(out: pathlib.Path, shard: Shard, *, is_mine: bool) -> dict | None:
     """What a complete shard says about itself; None where it is not complete, or was made of something else.
 
     Only a machine's own shards are compared with its source: file times of another machine's copy may differ.
     """
+    name = manifest.shard_name(shard.number)
     try:
-        entry = json.loads((out / _name(shard.number)).with_suffix(".json").read_text(encoding="utf-8"))
+        entry = json.loads((out / name).with_suffix(".json").read_text(encoding="utf-8"))
     except (OSError, ValueError, RecursionError):
         return None
-    if manifest.entry_fault(entry) or entry["file"] != _name(shard.number) or entry["frames"] != shard.frames:
+    if manifest.entry_fault(entry) or entry["file"] != name or entry["frames"] != shard.frames:
         return None
     made_of = entry.pop("source", None)
     if (is_mine and made_of != shard.source) or manifest.shard_fault(out, entry, checksum=False):
@@ -221,7 +219,7 @@ def _entry(out: pathlib.Path, shard: Shard, *, is_mine: bool) -> dict | None:
 def _remove_more(out: pathlib.Path, shards: int) -> None:
     """Removes shards that a longer source had before it was corrected."""
     number = shards
-    while (path := out / _name(number)).exists():
+    while (path := out / manifest.shard_name(number)).exists():
         path.unlink()
         path.with_suffix(".json").unlink(missing_ok=True)
         number += 1

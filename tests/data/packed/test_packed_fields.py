@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import warnings
+import zlib
 
 import numpy as np
 import pytest
@@ -186,14 +187,23 @@ def test_recorded_pictures_are_packed_as_their_bytes(tmp_path):
     assert images[5].read_bytes() not in (tmp_path / "lossy/shard-00000.arrayrecord").read_bytes()
 
 
-def test_a_pack_from_before_is_still_read(tmp_path, monkeypatch):
+@pytest.mark.parametrize("version", [1, 2])
+def test_a_pack_from_before_is_still_read(tmp_path, monkeypatch, version):
     root = writers.write_plain(tmp_path / "source", {"train/a": 6})
+    encode = records.encode_frame
+
+    def encode_as_before(frame, encoding, pictures, _):
+        record = encode(frame, encoding, pictures if version > 1 else ())
+        size = 4 + int.from_bytes(record[:4], "little")
+        header = json.dumps(json.loads(record[4:size])["fields"]).encode()
+        record = len(header).to_bytes(4, "little") + header + record[size:-4]
+        return record + zlib.crc32(record).to_bytes(4, "little")
+
     with monkeypatch.context() as before:
-        encode = records.encode_frame
-        before.setattr(records, "encode_frame", lambda frame, encoding, _: encode(frame, encoding))
+        before.setattr(records, "encode_frame", encode_as_before)
         assert packed_writer.pack(root, tmp_path / "out", workers=1)
     path = tmp_path / "out/manifest.json"
-    content = json.loads(path.read_text()) | {"schema_version": 1}
+    content = json.loads(path.read_text()) | {"schema_version": version}
     assert "lacks" not in content["sequences"][0]  # as ever, where nothing is lacking
     del content["description"]["route_map"]
     path.write_text(json.dumps(content))

@@ -123,6 +123,30 @@ def test_flipped_bytes_are_found(packed):
         assert len(frames_of(sources.open_recording(packed, skip_corrupt_shards=True))) == 19
 
 
+def test_shards_that_were_exchanged_are_no_frames_of_other_runs(packed):
+    """They are of one size, and every record is whole."""
+    first, second = (packed / f"shard-0000{number}.arrayrecord" for number in (0, 1))
+    assert first.stat().st_size == second.stat().st_size
+    first.rename(packed / "aside")
+    second.rename(first)
+    (packed / "aside").rename(second)
+    with pytest.raises(schema.DataError, match=r"shard-00000.arrayrecord, record 0: .*it is row 5 of run train/a, not "
+                                               r"row 0 of run train/a: were shards exchanged"):
+        frames_of(sources.open_recording(packed))
+    with pytest.warns(schema.DataWarning, match="2 of 5 shards are damaged and skipped, 10 of 24 frames"):
+        recording = sources.open_recording(packed, skip_corrupt_shards=True)
+    assert len(frames_of(recording)) == 14
+
+
+@pytest.mark.parametrize("order", [[1, 0, 2, 3, 4], [0, 0, 2, 3, 4]], ids=["exchanged", "twice"])
+def test_a_manifest_names_its_shards_in_their_order(packed, order):
+    content = json.loads((packed / "manifest.json").read_text())
+    content["shards"] = [content["shards"][number] for number in order]
+    (packed / "manifest.json").write_text(json.dumps(content))
+    with pytest.raises(schema.DataError, match=r"shards\[\d\]: file is shard-0000\d\S*, expected shard-0000"):
+        packed_reader.PackedRecording(packed)
+
+
 def test_records_are_not_unpickled_and_lossy_ones_are_smaller(source):
     frame = plain_reader.PlainRecording(source).read(plain_reader.PlainRecording(source).sequences[0], 0)
     rng = np.random.default_rng(0)

@@ -6,6 +6,7 @@ was corrected since makes those shards anew that it touches.
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import pathlib
@@ -57,6 +58,7 @@ def pack(source: pathlib.Path | str, out: pathlib.Path | str, *, encoding: recor
       DataError: for a source that cannot be read.
       BlockingIOError: where another process packs the same shards now.
       FileExistsError: where `out` holds another recording or other settings.
+      OSError: where a shard cannot be written; complete ones are kept.
       RuntimeError: where a worker was killed.
     """
     if not 0 <= machine < machines or frames_per_shard < 1 or (workers is not None and workers < 1):
@@ -98,23 +100,37 @@ def write_shard(recording: schema.Recording, out: pathlib.Path, encoding: record
     path = out / manifest.shard_name(shard.number)
     draft = path.with_name(f".{path.name}.draft")
     path.with_suffix(".json").unlink(missing_ok=True)
-    writer = array_record_module.ArrayRecordWriter(str(draft), "group_size:1,uncompressed")
+    with _writing(path):
+        writer = array_record_module.ArrayRecordWriter(str(draft), "group_size:1,uncompressed")
     try:
         for sequence, start, stop in shard.parts:
             for index in range(start, stop):
                 with files.keeping_pictures() as pictures:
                     frame = recording.read(sequence, index)
                 place = records.place_of(sequence.name, sequence.start + index)
-                writer.write(records.encode_frame(frame, encoding, pictures, place))
+                record = records.encode_frame(frame, encoding, pictures, place)
+                with _writing(path):
+                    writer.write(record)
                 yield shard.number
     finally:
-        writer.close()
+        with _writing(path):
+            writer.close()
     with draft.open("rb") as file:
         os.fsync(file.fileno())
     entry = {"file": path.name, "frames": shard.frames, "bytes": draft.stat().st_size,
              "sha256": manifest.file_sha256(draft)}
     os.replace(draft, path)
     files.write_atomically(path.with_suffix(".json"), json.dumps(entry | {"source": shard.source}))
+
+
+@contextlib.contextmanager
+def _writing(path: pathlib.Path) -> Iterator[None]:
+    """Makes an OSError of what ArrayRecord raises where it cannot write."""
+    try:
+        yield
+    except RuntimeError as error:
+        raise OSError(f"{path}: cannot be written ({error}). Make room on the disk, or correct permissions, and pack "
+                      f"again; shards that are complete are kept.") from error
 
 
 def _write_all(recording: schema.Recording, out: pathlib.Path, shards: list[Shard], encoding: records.Encoding,

@@ -6,6 +6,7 @@ import json
 import os
 import pathlib
 import pickle
+import resource
 import shutil
 import signal
 import struct
@@ -202,6 +203,22 @@ def test_an_error_is_the_same_from_one_worker_and_from_several(source, tmp_path,
     with pytest.raises(schema.DataError, match=r"000003.npz: not a readable NPZ file"):
         packed_writer.pack(broken, tmp_path / "out", frames_per_shard=5, workers=workers)
     assert not (tmp_path / "out/manifest.json").exists()
+
+
+def test_a_full_disk_is_told_and_complete_shards_are_kept(source, tmp_path):
+    recording, out = shutil.copytree(source, tmp_path / "copy"), tmp_path / "out"
+    points_m = np.random.default_rng(0).uniform(-50, 50, (20_000, 3)).astype(np.float32)
+    np.savez(recording / "train/b/lidar/000002.npz", points_m=points_m)
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (200_000, limits[1]))
+    try:
+        with pytest.raises(OSError, match=r"shard-00002.arrayrecord: cannot be written \(.*too large.* kept"):
+            packed_writer.pack(recording, out, frames_per_shard=5, workers=1)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    kept = (out / "shard-00001.arrayrecord").stat().st_mtime_ns
+    assert packed_writer.pack(recording, out, frames_per_shard=5, workers=1)
+    assert (out / "shard-00001.arrayrecord").stat().st_mtime_ns == kept
 
 
 def test_a_corrected_source_packs_anew_what_it_touches(source, tmp_path):

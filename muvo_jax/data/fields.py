@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from muvo_jax.config import BIRDS_EYE_CLASSES
 from muvo_jax.data.errors import DataError
 from muvo_jax.limits import FINITE, Limits, at_least, between
 
@@ -92,8 +93,8 @@ TABLE = (
     Field("image_classes", np.uint8, ("H", "W"), is_label=True, folder="classes", suffixes=(".png",)),
     Field("image_instance_mask", np.bool_, ("H", "W"), is_label=True, folder="classes", suffixes=(".png",)),
     Field("point_classes", np.uint8, ("N",), is_label=True, folder="lidar", suffixes=(".npz",), array="point_tags"),
-    Field("birds_eye_classes", np.uint8, ("X", "Y"), is_label=True, folder="birds_eye", suffixes=(".npz",),
-          array="birds_eye_classes"),
+    Field("birds_eye_classes", np.uint8, ("X", "Y"), values=(*range(BIRDS_EYE_CLASSES), UNKNOWN), is_label=True,
+          folder="birds_eye", suffixes=(".npz",), array="birds_eye_classes"),
     Field("birds_eye_instances", np.int32, ("X", "Y"), limits=at_least(0), is_label=True, folder="birds_eye",
           suffixes=(".npz",), array="birds_eye_instances"),
     Field("frame_id", np.int64, limits=between(0, 2**63 - 1), columns=("frame_id",), required=True),

@@ -209,7 +209,7 @@ def test_no_field_takes_a_number_that_it_cannot_have(field):
     shape = tuple(SIZES.get(size, size) for size in field.shape)
     good = np.zeros(shape, field.dtype)
     assert fields.conform(field.name, good, "here").dtype == field.dtype
-    wrong = [7] if field.values else [value for value, whole in (
+    wrong = [77] if field.values else [value for value, whole in (
         (field.limits.lowest - 1, True), (field.limits.highest * 2 + 1, field.limits.highest < 2**62)) if
         np.isfinite(value) and whole]
     for value in wrong:

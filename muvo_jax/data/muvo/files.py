@@ -97,9 +97,13 @@ def read_birdview(path: pathlib.Path) -> np.ndarray:
     """Returns the bit field, uint16 [BIRDVIEW_PX, BIRDVIEW_PX]; bit k is BIRDVIEW_BITS[k].
 
     Raises:
-      DataError: where the file is missing, damaged or no grey image of whole numbers and this size.
+      DataError: where the file is missing, damaged, no grey image of whole numbers and this size, or has other bits.
     """
     pixels = _read(path, (BIRDVIEW_PX, BIRDVIEW_PX))
+    if pixels.min() < 0 or pixels.max() >= 1 << len(BIRDVIEW_BITS):
+        raise schema.DataError(f"{path}: its numbers reach from {pixels.min()} to {pixels.max()}, expected a field of "
+                               f"{len(BIRDVIEW_BITS)} bits, one for each of {', '.join(BIRDVIEW_BITS)}. Write it as "
+                               f"the authors' DataWriter does.")
     return pixels.astype(np.uint16)  # Pillow says int32 or uint16, depending on its version
 
 

@@ -82,6 +82,7 @@ def labelled(tmp_path):
 
 @pytest.mark.parametrize(("kind", "pixels", "message"), [
     ("depth_semantic", np.zeros((32, 32, 4), np.uint8), "1.png: 32x32 pixels, but the camera's images have 64x32"),
+    ("birdview", np.full((192, 192), 1 << 8, np.uint16), "1.png: its numbers reach from 256 to 256, .* 8 bits"),
     ("birdview", np.ones((40, 50), np.uint16), r"1.png: an image \[40, 50\] of .*, expected \[192, 192\]"),
 ])
 def test_labels_are_of_the_size_of_what_they_label(labelled, kind, pixels, message):

@@ -10,6 +10,7 @@ import pathlib
 import struct
 import tokenize
 import tomllib
+import uuid
 import warnings
 import zipfile
 import zlib
@@ -309,7 +310,7 @@ def numbered(folder: pathlib.Path, suffixes: str | Sequence[str]) -> dict[int, s
 
 def write_atomically(path: pathlib.Path, content: str | bytes) -> None:
     """Writes a file such that it is there whole or not at all."""
-    draft = path.with_name(f".{path.name}.{os.getpid()}")
+    draft = path.with_name(f".{path.name}.{uuid.uuid4().hex}")  # other machines may have this process id, too
     draft.write_bytes(content.encode() if isinstance(content, str) else content)
     os.replace(draft, path)
 

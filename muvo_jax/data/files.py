@@ -31,6 +31,8 @@ PICTURE_FORMATS = ("PNG", "JPEG")  # as Pillow names them
 _FORMATS = (*PICTURE_FORMATS, "BMP", "TIFF")
 PICTURE_MODES = ("RGB", "RGBA", "L", "classes", "depth_m")
 _HEADER_TRIES = 8
+_PNG_BITS = 24  # where a PNG says how many bits a sample has
+_GREY_SPREADS = {2: 85, 4: 17}
 RULE_FILE = "rule.json"  # beside occupancy: how it was made
 _NOT_FRAMES = ("Thumbs.db", "desktop.ini", RULE_FILE)
 # Pillow raises any of these for broken chunks and for sizes that would fill the memory.
@@ -105,7 +107,7 @@ def decode_image(content: bytes, mode: str | None, where: str, shape: tuple[int,
             if shape is not None and sorted((image.height, image.width)) != sorted(shape[:2]):
                 raise schema.DataError(f"{where}: a picture of {image.width}x{image.height} pixels, expected "
                                        f"{list(shape)}")
-            pixels = _pixels(image, mode, where)
+            pixels = _pixels(image, mode, where, content)
             kept = _keeping.get()
             if kept is not None and mode is not None and image.format in PICTURE_FORMATS:
                 pixels.flags.writeable = False  # they stay what the bytes say
@@ -123,7 +125,7 @@ def decode_depth(pixels: np.ndarray) -> np.ndarray:
     return np.where(pixels == DEPTH_SKY, np.float32(np.inf), pixels.astype(np.float32) * np.float32(DEPTH_UNIT_M))
 
 
-def _pixels(image: Image.Image, mode: str | None, where: str) -> np.ndarray:
+def _pixels(image: Image.Image, mode: str | None, where: str, content: bytes) -> np.ndarray:
     if mode is None:
         return np.asarray(image)
     is_wide = image.mode.startswith(("I", "F"))  # more than 8 bits
@@ -133,7 +135,9 @@ def _pixels(image: Image.Image, mode: str | None, where: str) -> np.ndarray:
             raise _other_pixels(where, image, "16 bits of grey, the depth in centimetres")
         return decode_depth(pixels)
     if mode == "classes" and image.mode in ("L", "P", "1"):
-        return np.asarray(image).astype(np.uint8, copy=False)
+        # Pillow spreads 2 and 4 bits of grey over 0 to 255.
+        spread = _GREY_SPREADS.get(content[_PNG_BITS], 1) if image.format == "PNG" and image.mode == "L" else 1
+        return np.asarray(image).astype(np.uint8, copy=False) // np.uint8(spread)
     if is_wide:
         raise _other_pixels(where, image, "8 bits of each colour")
     if mode in ("RGB", "RGBA"):

@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import struct
 import warnings
 import zlib
 
@@ -185,6 +186,29 @@ def test_recorded_pictures_are_packed_as_their_bytes(tmp_path):
     assert (tmp_path / "again/shard-00000.arrayrecord").read_bytes() == shard
     assert packed_writer.pack(root, tmp_path / "lossy", encoding=records.Encoding(jpeg_quality=50), workers=1)
     assert images[5].read_bytes() not in (tmp_path / "lossy/shard-00000.arrayrecord").read_bytes()
+
+
+def grey_png(pixels, bits):
+    """The bytes of a grey PNG of 1, 2, 4 or 8 bits."""
+    rows = ["".join(f"{value:0{bits}b}" for value in row) for row in pixels.tolist()]
+    raw = b"".join(b"\0" + int(row, 2).to_bytes(len(row) // 8, "big") for row in rows)
+    chunk = lambda kind, data: struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+    height, width = pixels.shape
+    return (b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", struct.pack(">IIBBBBB", width, height, bits, 0, 0, 0, 0))
+            + chunk(b"IDAT", zlib.compress(raw)) + chunk(b"IEND", b""))
+
+
+@pytest.mark.parametrize("bits", [1, 2, 4, 8])
+def test_classes_are_the_numbers_that_are_stored_whatever_their_bits(tmp_path, bits):
+    root = writers.write_plain(tmp_path / "source", {"train/a": 2})
+    classes = (np.arange(32 * 64, dtype=np.uint8) % min(2**bits, 10)).reshape(32, 64)
+    (root / "train/a/classes").mkdir()
+    for number in range(2):
+        (root / f"train/a/classes/{number:06d}.png").write_bytes(grey_png(classes, bits))
+    assert packed_writer.pack(root, tmp_path / "out", workers=1)
+    for path in (root, tmp_path / "out"):
+        recording = opened(path, schema.LABELS)
+        np.testing.assert_array_equal(recording.read(recording.sequences[0], 1)["image_classes"], classes)
 
 
 @pytest.mark.parametrize("version", [1, 2])

@@ -206,12 +206,27 @@ def npz_names(path: pathlib.Path) -> frozenset[str] | None:
 
 
 def read_toml(path: pathlib.Path) -> dict:
-    """Returns a parsed TOML file; raises DataError where it is missing or malformed."""
+    """Returns a parsed TOML file; raises DataError where it is missing or malformed, or a number has over 64 bits."""
+    content = read_bytes(path, "a TOML description")
     try:
-        text = read_bytes(path, "a TOML description").decode("utf-8-sig")  # editors may write a byte order mark
-        return tomllib.loads(text.replace("\r\n", "\n").replace("\r", "\n"))
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
+        text = content.decode("utf-8-sig")  # editors may write a byte order mark
+        values = tomllib.loads(text.replace("\r\n", "\n").replace("\r", "\n"))
+        name = _too_large(values, "")
+    except (ValueError, RecursionError) as error:  # Python's own ValueError, too: a number of thousands of digits
         raise schema.DataError(f"{path}: not valid TOML ({error}).") from error
+    if name is not None:
+        raise schema.DataError(f"{path}: {name.removeprefix('.')} is a whole number of more than 64 bits; it must be "
+                               f"at least -2**63 and below 2**63.")
+    return values
+
+
+def _too_large(value: Any, name: str) -> str | None:
+    """The name of a whole number, in a table or list of this name, that TOML cannot have; None where there is none."""
+    if isinstance(value, int):
+        return None if -2**63 <= value < 2**63 else name
+    items = ([(f"{name}.{key}", item) for key, item in value.items()] if isinstance(value, dict) else
+             [(f"{name}[{index}]", item) for index, item in enumerate(value)] if isinstance(value, list) else [])
+    return next((found for name, item in items if (found := _too_large(item, name)) is not None), None)
 
 
 def is_folder_name(name: str) -> bool:

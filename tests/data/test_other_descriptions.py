@@ -38,6 +38,11 @@ from muvo_jax.data.plain import reader as plain_reader
     ({"voxel_size_m": "-1"}, "voxels.voxel_size_m is -1.0; it must be above 0"),
     ({"shape": "[16, 0, 16]"}, "voxels.shape is .*at least 1"),
     ({"accel_full_mps2": "0"}, "action.accel_full_mps2 is 0.0; it must be above 0"),
+    ({"rate_hz": "1" + "0" * 400}, "rate_hz is a whole number of more than 64 bits; it must be at least -2"),
+    ({"rate_hz": "1" + "0" * 5000}, "not valid TOML .*4300 digits"),
+    ({"rate_hz": "0x1" + "0" * 5000}, "rate_hz is a whole number of more than 64 bits"),
+    ({"accel_full_mps2": "1" + "0" * 400}, "action.accel_full_mps2 is a whole number of more than 64 bits"),
+    ({"shape": f"[16, {2**63}, 16]"}, r"voxels.shape\[1\] is a whole number of more than 64 bits"),
     ({"source": '"measured"'}, "action.source: 'measured' is unknown"),
 ])
 def test_descriptions_that_cannot_be_are_refused_by_name(tmp_path, changes, message):

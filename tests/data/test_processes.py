@@ -6,7 +6,7 @@ import threading
 
 import pytest
 
-from muvo_jax.data import processes, schema
+from muvo_jax.data import files, processes, schema
 
 
 def halved(minuend, number):
@@ -54,3 +54,16 @@ def test_a_lock_refuses_or_waits(tmp_path):
         order.append("first")
     thread.join(timeout=10)
     assert order == ["first", "second"]
+
+
+def test_two_machines_of_one_process_id_may_write_one_file(tmp_path, monkeypatch):
+    path, replace = tmp_path / "plan.json", os.replace
+
+    def replace_after_the_other(draft, target):
+        monkeypatch.setattr(os, "replace", replace)
+        files.write_atomically(path, "theirs")
+        replace(draft, target)
+
+    monkeypatch.setattr(os, "replace", replace_after_the_other)
+    files.write_atomically(path, "ours")
+    assert path.read_text() == "ours" and list(tmp_path.iterdir()) == [path]

@@ -21,14 +21,13 @@ from typing import IO, NamedTuple, cast
 import numpy as np
 
 from muvo_jax import config as config_lib
-from muvo_jax.data import files, processes, schema
+from muvo_jax.data import processes, schema
 from muvo_jax.data.plain import writer as plain_writer
 from muvo_jax.town import driver, settings
 from muvo_jax.town.simulator import WEATHER_NAMES, Town, TownState
 
 # Raised by whatever changes the bytes of a recording, so that old caches are not taken for new ones.
 RECORDING_VERSION = 2
-COMPLETE_FILE = "complete.json"
 # Frames before the first recorded one: the expert has settled and traffic has spread.
 WARM_UP_FRAMES = 20
 # Below this many frames a worker process costs more time than it saves.
@@ -91,7 +90,7 @@ def cached_town(config: config_lib.Config, progress: Progress | None = None, *,
     known = settings.SIZES[config.data.town_size]
     if split is not None and split not in known:
         raise ValueError(f"the town has no split {split!r}; it has {', '.join(known)}.")
-    if not (directory / COMPLETE_FILE).is_file():
+    if _missing(directory, config.data.town_size, split):
         record_town(directory, town_config, config.data.town_size, progress=progress, split=split)
     return directory
 
@@ -122,11 +121,10 @@ def record_town(directory: pathlib.Path | str, town_config: settings.TownConfig,
       WorkerError: where a worker failed; its message is included.
     """
     directory = pathlib.Path(directory)
-    planned = [job for job in jobs(size) if split in (None, job.split)]
     describe(directory, town_config, tuple(settings.SIZES[size]))
     with processes.locked(directory / ".lock", "recording", wait=True):
-        missing = [job for job in planned if not plain_writer.is_complete(directory, job.split, job.run)]
-        total = sum(job.frames for job in planned)
+        missing = _missing(directory, size, split)
+        total = sum(job.frames for job in jobs(size) if split in (None, job.split))
         done = total - sum(job.frames for job in missing)
         if workers is None:
             workers = min(os.cpu_count() or 1, (total - done) // WORKER_FRAMES)
@@ -136,10 +134,13 @@ def record_town(directory: pathlib.Path | str, town_config: settings.TownConfig,
             done += count
             if progress is not None:
                 progress(done, total)
-        if split is None:
-            files.write_atomically(directory / COMPLETE_FILE,
-                                   json.dumps({"frames": total, "version": RECORDING_VERSION}))
     return directory
+
+
+def _missing(directory: pathlib.Path, size: str, split: str | None) -> list[TownDrive]:
+    """The runs of a size, or of one of its splits, that are not complete."""
+    return [job for job in jobs(size)
+            if split in (None, job.split) and not plain_writer.is_complete(directory, job.split, job.run)]
 
 
 def describe(directory: pathlib.Path, town_config: settings.TownConfig, splits: tuple[str, ...]) -> None:

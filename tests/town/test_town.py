@@ -1,6 +1,7 @@
 import copy
 import dataclasses
 import math
+import shutil
 
 import jax
 import numpy as np
@@ -269,7 +270,6 @@ def test_cached_town_is_recorded_once_and_goes_on_after_an_interruption(tmp_path
     assert recording.description.modalities >= {"image", "points_m", "occupancy", "route_map", "reward", "is_terminal"}
 
     before = {path: path.read_bytes() for path in folder.rglob("*") if path.is_file() and "train/001" in str(path)}
-    (folder / record.COMPLETE_FILE).unlink()
     for path in before:  # as if the second run had been interrupted after some frames
         if path.name == "frames.csv" or path.stem > "000005":
             path.unlink()
@@ -278,6 +278,10 @@ def test_cached_town_is_recorded_once_and_goes_on_after_an_interruption(tmp_path
     assert reports[0] == (37, 48) and reports[-1] == (48, 48)  # only the second run was made again
     assert {path: path.read_bytes() for path in before} == before
     assert record.cached_town(config, lambda *_: pytest.fail("nothing is left to record")) == folder
+    shutil.rmtree(folder / "val_ds")  # by somebody who wanted room
+    record.cached_town(config, lambda *_: pytest.fail("all that is asked for is there"), split="train")
+    record.cached_town(config)
+    assert len(list(folder.glob("val_ds/*/frames.csv"))) == 1
 
 
 def test_workers_record_the_same_bytes_as_one_process(tmp_path):

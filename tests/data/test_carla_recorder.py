@@ -3,6 +3,7 @@
 import importlib.util
 import json
 import math
+import os
 import pathlib
 import queue
 import sys
@@ -320,3 +321,14 @@ def test_an_estimate_reads_the_folder_of_a_user_and_a_run_without_a_row(tmp_path
     folder.mkdir(parents=True)
     (folder / "frames.csv").write_text("frame_id,timestamp_s\n")
     assert carla_drives.estimate(pathlib.Path("~/rec"), jobs, carla_drives.Settings()).measured
+
+
+def test_occupancy_that_was_made_later_is_no_part_of_an_estimate(tmp_path):
+    (job, *_) = jobs = carla_drives.plan(towns=("Town01",), train_runs=2, val_runs=0, run_s=2.0)
+    folder = tmp_path / job.split / job.run
+    for name, time_s in (("image/000000.png", 0), ("frames.csv", 2), ("occupancy/000000.npz", 86_400)):
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).write_bytes(b"\n" * 21)
+        os.utime(folder / name, (1e9 + time_s,) * 2)
+    needed = carla_drives.estimate(tmp_path, jobs, carla_drives.Settings())
+    assert needed.missing == 20 and needed.disk_bytes == 42 and needed.hours * 3600 == pytest.approx(2.0)

@@ -21,6 +21,8 @@ WEATHERS = ("ClearNoon", "WetNoon", "HardRainNoon", "ClearSunset")
 SHIFTED_WEATHERS = ("CloudyNoon", "WetSunset", "SoftRainSunset", "MidRainyNoon")  # the paper names none
 SPLITS = ("train", "val_rl", "val_ds")
 RUN_S = 300.0
+# What the recorder writes of each frame, beside frames.csv: folder -> suffix.
+FILES = {"image": "png", "depth": "png", "classes": "png", "route_map": "png", "lidar": "npz"}
 
 
 class CarlaError(OSError):
@@ -116,7 +118,9 @@ def estimate(out: pathlib.Path, jobs: Sequence[CarlaDrive], settings: Settings) 
     frame_bytes, frame_s = float(settings.raw_bytes), 1.0 / settings.rate_hz
     if complete:
         folder = out / complete[0].split / complete[0].run
-        written = [path.stat() for path in folder.rglob("*") if path.is_file()]
+        # Occupancy that was made of the run later is no part of its recording.
+        patterns = [plain_reader.FRAMES_FILE, *(f"{name}/*.{suffix}" for name, suffix in FILES.items())]
+        written = [path.stat() for pattern in patterns for path in folder.glob(pattern)]
         times = [status.st_mtime for status in written]
         lines = (folder / plain_reader.FRAMES_FILE).read_text(encoding="utf-8").splitlines()
         rows = max(len(lines) - 1, 1)

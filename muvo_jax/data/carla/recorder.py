@@ -17,7 +17,7 @@ import numpy as np
 
 from muvo_jax.data import processes, schema
 from muvo_jax.data.carla import frames as carla_frames
-from muvo_jax.data.carla.drives import SPLITS, BadDriveError, CarlaDrive, CarlaError, Settings, estimate
+from muvo_jax.data.carla.drives import FILES, SPLITS, BadDriveError, CarlaDrive, CarlaError, Settings, estimate
 from muvo_jax.data.carla.frames import SENSORS, Tick
 from muvo_jax.data.muvo import files as muvo_files
 from muvo_jax.data.muvo import reader as muvo_reader
@@ -164,8 +164,7 @@ class Health:
 
 def check_written(folder: pathlib.Path, frames: int) -> None:
     """Raises CarlaError where a sensor has fewer files than frames, or empty ones."""
-    for name, suffix in (("image", "png"), ("depth", "png"), ("classes", "png"), ("route_map", "png"),
-                         ("lidar", "npz")):
+    for name, suffix in FILES.items():
         count = sum(path.stat().st_size > 0 for path in (folder / name).glob(f"*.{suffix}"))
         if not frames or count != frames:
             raise CarlaError(f"{folder / name}: {count} files for {frames} frames. Is the disk full, or does another "

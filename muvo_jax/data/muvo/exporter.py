@@ -173,7 +173,8 @@ def _write_run(recording: plain_reader.PlainRecording, sequence: schema.Sequence
     for kind in (*muvo_files.KINDS, "image_left", "image_right", "image_all"):
         (target / kind).mkdir(parents=True)
     described = recording.description
-    has_voxels = described.voxels == muvo_reader.VOXELS and "occupancy" in described.modalities
+    has_voxels = (described.voxels == muvo_reader.VOXELS and "occupancy" in described.modalities
+                  and sequence.has(("occupancy",)))
     if not has_voxels:
         (target / "voxel").rmdir()
     rows = []

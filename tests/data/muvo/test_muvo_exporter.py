@@ -87,6 +87,20 @@ def test_what_is_read_back_is_what_was_recorded(source, exported):
     assert (points.tags == 8).all()
 
 
+def test_a_run_without_occupancy_has_no_voxels(source, tmp_path):
+    recording = shutil.copytree(source, tmp_path / "source", ignore=lambda _, names: [
+        name for name in names if name[:6].isdigit() and int(name[:6]) > 1])
+    for table in recording.glob("*/*/frames.csv"):
+        table.write_text("".join(table.read_text().splitlines(keepends=True)[:3]))
+    shutil.copytree(recording / "train/a", recording / "train/c")
+    shutil.rmtree(recording / "train/c/occupancy")
+    with pytest.warns(schema.DataWarning, match="occupancy is missing in 1 of 3 runs"):
+        muvo_exporter.export(recording, tmp_path / "out")
+    tables = {run.name: "voxel_path" in run.columns for run in muvo_runs.find_runs(tmp_path / "out")}
+    assert tables == {"train/Town01/0000": True, "train/Town01/0001": False, "val0/Town01/0000": True}
+    assert not (tmp_path / "out/trainval/train/Town01/0001/voxel").exists()
+
+
 def test_an_export_is_resumed_and_other_sensors_are_refused(source, exported, tmp_path):
     (exported / "trainval/val0/Town01/0000" / muvo_runs.FRAME_FILE).unlink()
     assert muvo_exporter.export(source, exported) == FRAMES

@@ -137,6 +137,8 @@ class PlainRecording:
         for name in fields.FIELDS:
             if name in names and self._has(sequence, name) and fields.FIELDS[name].folder:
                 frame |= self._of_file(run, name, position, frame)
+        if "points_m" in frame:
+            frame["points_m"] = files.finite_points(frame["points_m"], self.path(sequence, index, "points_m"))
         camera = self.description.camera
         if "image" in frame and camera is not None:
             frame |= cameras.of_frame(run.columns, position, camera)
@@ -167,16 +169,14 @@ class PlainRecording:
         return field.of_cells([run.columns[column][position] for column in field.columns])
 
     def _of_file(self, run: Run, name: str, position: int, frame: dict[str, Any]) -> dict[str, Any]:
-        """The field of a frame, and what comes with it."""
+        """The field of a frame, and what comes with it; of points those that are not finite, too."""
         path = self._path(run, name, int(run.columns["frame_id"][position]))
         if name == "image_instance_mask":
             classes = frame["image_classes"] if "image_classes" in frame else self._read(path, "image_classes")
             return {"image_classes": classes, name: schema.instance_mask(classes, self._class_names)}
         values = self._read(path, name)
-        if name == "points_m":
-            values = files.finite_points(values, path)
         if name == "point_classes":
-            points_m = self._read(path, "points_m")
+            points_m = frame["points_m"] if "points_m" in frame else self._read(path, "points_m")
             if len(values) != len(points_m):
                 raise schema.DataError(f"{path}: {len(values)} {fields.FIELDS[name].array} of {len(points_m)} points. "
                                        f"Write a class for each point, in the order of the points.")

@@ -257,7 +257,8 @@ def _survey_muvo(path: pathlib.Path, rule: str) -> tuple[Rig, dict[pathlib.Path,
                                    f"made from depth and lidar. Record both.")
         names = (muvo_reader.occupancy_names(run) if rule == "carved" else
                  [muvo_files.file_name("voxel", number) for number in muvo_runs.numbering(run).tolist()])
-        runs[run.folder] = [Frame(run.path("depth_semantic", row), run.path("points_semantic", row), run.folder / name)
+        depths, scans = (muvo_runs.find_files(run, kind) for kind in ("depth_semantic", "points_semantic"))
+        runs[run.folder] = [Frame(depths.path(row), scans.path(row), run.folder / name)
                             for row, name in enumerate(names)]
     return Rig(True, rule, camera, (lidar or muvo_reader.LIDAR).position_m, grid or muvo_reader.VOXELS), runs
 

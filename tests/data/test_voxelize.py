@@ -210,6 +210,16 @@ def test_the_reference_rule_writes_the_authors_voxels(layout):
 
 
 @needs_layout
+def test_files_of_the_layout_may_have_any_name_that_the_reader_takes(layout):
+    run = layout / "trainval/train/Town01/0000"
+    keep_rows(run, 1)
+    for kind, suffix in (("depth_semantic", ".PNG"), ("points_semantic", ".NPY")):
+        for path in (run / kind).iterdir():
+            path.rename(path.with_suffix(suffix))
+    assert voxelizing.voxelize(layout, workers=1) == (1, 0)
+
+
+@needs_layout
 def test_carved_occupancy_of_the_layout_is_read_in_place_of_its_voxels(layout):
     run = layout / "trainval/train/Town01/0000"
     keep_rows(run, 12)

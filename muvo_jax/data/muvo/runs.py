@@ -157,12 +157,19 @@ class KindFiles:
     """The files of one kind of a run.
 
     Attributes:
+      run, kind: whose.
       present: bool [F], which rows have one.
       unusual: row -> the file, where it is not the one that the table names: another suffix or other case.
     """
 
+    run: Run
+    kind: str
     present: np.ndarray
     unusual: dict[int, pathlib.Path]
+
+    def path(self, row: int) -> pathlib.Path:
+        """The file of a frame; where there is none, the one that the table names."""
+        return self.unusual.get(row) or self.run.path(self.kind, row)
 
 
 def find_files(run: Run, kind: str) -> KindFiles:
@@ -174,7 +181,7 @@ def find_files(run: Run, kind: str) -> KindFiles:
     present = np.zeros(run.frames, bool)
     unusual: dict[int, pathlib.Path] = {}
     if f"{kind}_path" not in run.columns:
-        return KindFiles(present, unusual)
+        return KindFiles(run, kind, present, unusual)
     folders: dict[str, _Folder] = {}  # by the path in the table
     for row, relative in enumerate(run.columns[f"{kind}_path"]):
         head, _, name = _with_slashes(relative).rpartition("/") if isinstance(relative, str) else ("", "", "..")
@@ -190,7 +197,7 @@ def find_files(run: Run, kind: str) -> KindFiles:
         path = run.path(kind, 0)
         raise schema.DataError(f"{path.parent}: holds {files.listing(path.parent)}, but {FRAME_FILE} names {path.name} "
                                f"and its like. Rename the files as the table names them, or take the folder away.")
-    return KindFiles(present, unusual)
+    return KindFiles(run, kind, present, unusual)
 
 
 class _Folder:

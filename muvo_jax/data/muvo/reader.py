@@ -18,6 +18,7 @@ anything (safe_pickle.py).
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import math
 import pathlib
 import warnings
@@ -101,7 +102,7 @@ class MuvoRecording:
             name=path.resolve().name, kind="MUVO CARLA", rate_hz=rate_hz,
             modalities=modalities | ({"intrinsics", "camera_to_ego"} if "image" in modalities else set()),
             splits=tuple(sorted(present, key=lambda split: (split != "train", split))), notes=notes,
-            camera=(section("camera") or self._assumed_camera(kept)) if "image" in modalities else None,
+            camera=(section("camera") or self._assumed_camera()) if "image" in modalities else None,
             lidar=(section("lidar") or LIDAR) if "points_m" in modalities else None,
             voxels=(section("voxels") or VOXELS) if "occupancy" in modalities else None,
             classes=muvo_files.CLASSES if labels & {"image_classes", "point_classes"} else (),
@@ -128,7 +129,7 @@ class MuvoRecording:
         wanted = {name for name in described.modalities if name in names and sequence.has((name,))}
         frame: schema.RawFrame = {name: values[row] for name, values in columns.items()  # type: ignore[assignment]
                                   if name in wanted}
-        paths = {key: self._path(run, kind, row) for key, kind in self._kinds.items() if key in wanted}
+        paths = {key: self._files[run.name][kind].path(row) for key, kind in self._kinds.items() if key in wanted}
         if described.camera is not None and "image" in paths:
             camera = described.camera
             frame["image"] = files.read_image(paths["image"], "RGB")
@@ -156,9 +157,6 @@ class MuvoRecording:
         """See schema.Recording."""
         return self._columns[sequence.name]["action"][sequence.start + index]
 
-    def _path(self, run: muvo_runs.Run, kind: str, row: int) -> pathlib.Path:
-        return self._files[run.name][kind].unusual.get(row) or run.path(kind, row)
-
     def _fields_of(self, run: muvo_runs.Run) -> frozenset[str]:
         found = {"speed_mps", "action", "reward", "is_terminal", "timestamp_s", "frame_id"}
         if "imu" in run.columns:
@@ -182,12 +180,21 @@ class MuvoRecording:
         cut = [(max(start, first), start + length) for start, length in pieces]
         return [schema.Sequence(run.split, run.name, start, stop - start, lacks) for start, stop in cut if stop > start]
 
-    def _assumed_camera(self, kept: list[muvo_runs.Run]) -> schema.Camera:
-        """The authors', with the size of the first image there is."""
-        first = next(self._path(run, "image", int(np.argmax(there))) for run in kept
-                     if (there := self._files[run.name]["image"].present).any())
-        height_px, width_px = files.read_image(first, "RGB").shape[:2]
-        return schema.Camera.level(width_px, height_px, FOV_RAD, MOUNT_M)
+    def _assumed_camera(self) -> schema.Camera:
+        """The authors', with the size of the first image that can be read, if possible one of the sequences."""
+        inside = ((sequence.name, sequence.start + index) for sequence in self.sequences if sequence.has(("image",))
+                  for index in range(sequence.length))
+        every = ((name, row) for name, found in self._files.items()
+                 for row in np.flatnonzero(found["image"].present).tolist())
+        faults = []
+        for name, row in itertools.chain(inside, every):
+            try:
+                height_px, width_px = files.read_image(self._files[name]["image"].path(row), "RGB").shape[:2]
+            except schema.DataError as error:
+                faults.append(error)
+            else:
+                return schema.Camera.level(width_px, height_px, FOV_RAD, MOUNT_M)
+        raise faults[0]
 
     def _translate(self, tags: np.ndarray, path: pathlib.Path) -> np.ndarray:
         return muvo_tags.to_layout(tags, self._tags, path)
@@ -198,20 +205,20 @@ class MuvoRecording:
         One run of each mode and town is looked at.
 
         Raises:
-          DataError: where classes are wanted and the tags do not tell, or those of two runs are of two sets.
+          DataError: where classes are wanted and the tags do not tell, or no file that has them can be read, or those
+            of two runs are of two sets.
         """
         wanted = self.description.modalities & {"image_classes", "image_instance_mask", "point_classes"}
         if not wanted and (self._is_carved or "occupancy" not in self.description.modalities):
             return None
         every: list[np.ndarray] = []
         ground: list[np.ndarray] = []
+        faults: list[schema.DataError] = []
         told: dict[muvo_tags.TagSet, str] = {}  # by which run first
         for run in {run.name.rpartition("/")[0]: run for run in kept}.values():
-            frames = [muvo_tags.of_frame(run, row) for row in {run.frames // 4, run.frames // 2}]
-            of_run = [tags for frame in frames for tags in frame.every]
-            below = [tags for frame in frames for tags in frame.ground]
-            every, ground = every + of_run, ground + below
-            if (found := muvo_tags.recognise(of_run, below, str(run.folder))) is not None:
+            of_run = muvo_tags.of_run(run)
+            every, ground, faults = every + of_run.every, ground + of_run.ground, faults + of_run.faults
+            if (found := muvo_tags.recognise(of_run.every, of_run.ground, str(run.folder))) is not None:
                 told.setdefault(found, run.name)
         if len(told) > 1:
             raise schema.DataError(f"{path}: run {told[muvo_tags.OLDER]} has the semantic tags of CARLA up to 0.9.13, "
@@ -219,6 +226,8 @@ class MuvoRecording:
                                    f"otherwise. Make two recordings of them, each with its tags in {SENSORS_FILE}.")
         tag_set = next(iter(told), None) or muvo_tags.recognise(every, ground, str(path))
         if tag_set is None and wanted:
+            if faults and not every:
+                raise faults[0]
             raise muvo_tags.undecided(str(path))
         return tag_set
 

@@ -26,6 +26,7 @@ _OLDER_TAGS, _NEWER_TAGS = len(muvo_files.CLASSES), 29
 _GROUND_SHARE, _GROUND_BAND_M = 0.5, 0.5
 # Where the two sets differ in what counts as occupied: the sky of either.
 _SKIES = (11, 13)
+_TRIES = 8
 
 
 def described(header: dict, path: pathlib.Path) -> TagSet | None:
@@ -41,38 +42,56 @@ def described(header: dict, path: pathlib.Path) -> TagSet | None:
     return named
 
 
-class FrameTags(NamedTuple):
-    """Tags of a frame's files: all of them, and those of the ground."""
+class RunTags(NamedTuple):
+    """Tags of some files of a run, all of them and those of the ground; and what was wrong with files passed by."""
 
     every: list[np.ndarray]
     ground: list[np.ndarray]
+    faults: list[schema.DataError]
 
 
-def of_frame(run: muvo_runs.Run, row: int) -> FrameTags:
-    """The tags that a frame's scan, voxels and picture hold, as far as they are there.
+def of_run(run: muvo_runs.Run) -> RunTags:
+    """The tags that scans, voxels and pictures of a run hold, as far as they are there.
 
-    Raises:
-      DataError: where one of these files is damaged.
+    Of each kind two files are looked at, a quarter and half of the way through the run; where one is damaged, which may
+    be of a kind that nobody reads, the next.
     """
-    found = FrameTags([], [])
-    paths = {kind: run.path(kind, row) for kind in ("points_semantic", "voxel", "depth_semantic")
-             if f"{kind}_path" in run.columns}
-    paths = {kind: path for kind, path in paths.items() if path.is_file()}
-    if "points_semantic" in paths:
-        scan = muvo_files.read_points(paths["points_semantic"], (0.0, 0.0, 0.0))
-        if scan.tags is not None and len(scan.tags):
-            found.every.append(scan.tags)
-            height_m = scan.points_m[:, 2]
-            found.ground.append(scan.tags[height_m < np.percentile(height_m, 5) + _GROUND_BAND_M])
-    if "voxel" in paths:
-        rows = safe_pickle.load_npy(paths["voxel"])
-        if isinstance(rows, np.ndarray) and rows.ndim == 2 and rows.shape[1] == 4 and len(rows):
-            found.every.append(rows[:, 3])
-    if "depth_semantic" in paths:
-        _, tags = muvo_files.read_depth_semantic(paths["depth_semantic"])
-        found.every.append(tags)
-        found.ground.append(tags[-max(len(tags) // 8, 1):])
+    found = RunTags([], [], [])
+    for kind, read in (("points_semantic", _of_scan), ("voxel", _of_voxels), ("depth_semantic", _of_picture)):
+        try:
+            there = muvo_runs.find_files(run, kind)
+        except schema.DataError as error:
+            found.faults.append(error)
+            continue
+        rows = np.flatnonzero(there.present)
+        for first in sorted({run.frames // 4, run.frames // 2}):
+            for row in rows[rows >= first][:_TRIES].tolist():
+                try:
+                    read(there.path(row), found)
+                    break
+                except schema.DataError as error:
+                    found.faults.append(error)
     return found
+
+
+def _of_scan(path: pathlib.Path, found: RunTags) -> None:
+    scan = muvo_files.read_points(path, (0.0, 0.0, 0.0))
+    if scan.tags is not None and len(scan.tags):
+        found.every.append(scan.tags)
+        height_m = scan.points_m[:, 2]
+        found.ground.append(scan.tags[height_m < np.percentile(height_m, 5) + _GROUND_BAND_M])
+
+
+def _of_voxels(path: pathlib.Path, found: RunTags) -> None:
+    rows = safe_pickle.load_npy(path)
+    if isinstance(rows, np.ndarray) and rows.ndim == 2 and rows.shape[1] == 4 and len(rows):
+        found.every.append(rows[:, 3])
+
+
+def _of_picture(path: pathlib.Path, found: RunTags) -> None:
+    _, tags = muvo_files.read_depth_semantic(path)
+    found.every.append(tags)
+    found.ground.append(tags[-max(len(tags) // 8, 1):])
 
 
 def recognise(every: Iterable[np.ndarray], ground: Iterable[np.ndarray], where: str) -> TagSet | None:

@@ -267,6 +267,24 @@ def test_two_runs_of_one_name_are_refused(tmp_path):
         sources.open_recording(tmp_path)
 
 
+def test_a_damaged_file_that_nobody_reads_takes_nothing_away(tmp_path):
+    root = layout(tmp_path, tags=OLDER)
+    for run in root.glob("trainval/*/*/*"):
+        columns = dict(safe_pickle.load_table(run / muvo_runs.FRAME_FILE))
+        columns["depth_semantic_path"] = [f"depth_semantic/{number}.png" for number in range(FRAMES)]
+        (run / muvo_runs.FRAME_FILE).write_bytes(frame_pickle.frame(columns))
+        (run / "depth_semantic").mkdir()
+        for name in (*columns["depth_semantic_path"], columns["image_path"][0], columns["points_semantic_path"][6]):
+            (run / name).write_bytes(b"half")  # of a kind that is not asked for, and in the first second
+    recording = sources.open_recording(root, labels={"point_classes"})
+    assert recording.description.camera.width_px == 64
+    assert set(recording.read(recording.sequences[0], 0)["point_classes"]) == set(OLDER.values()) - {OLDER["sky"]}
+    for scan in root.glob("trainval/*/*/*/points_semantic/*"):
+        scan.write_bytes(b"half")
+    with pytest.raises(schema.DataError, match=r"points_semantic_000000006.npy"):
+        sources.open_recording(root, labels={"point_classes"})
+
+
 def test_tags_beyond_a_byte_are_no_tags(tmp_path):
     root = layout(tmp_path, tags=OLDER)
     for path in root.glob("trainval/*/*/*/points_semantic/*.npy"):

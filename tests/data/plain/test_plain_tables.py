@@ -35,6 +35,18 @@ def test_a_point_that_is_left_out_takes_its_class_along(tmp_path):
     np.testing.assert_array_equal(frame["points_m"][:, 0], frame["point_classes"])
 
 
+def test_a_scan_with_classes_is_read_once(tmp_path, monkeypatch):
+    root = writers.write_plain(tmp_path, {"train/a": 3})
+    tagged(root, "train/a", 3)
+    recording = sources.open_recording(root, labels=schema.LABELS)
+    read, read_npz = [], files.read_npz
+    monkeypatch.setattr(files, "read_npz", lambda path, name: read.append(name) or read_npz(path, name))
+    recording.read(recording.sequences[0], 0)
+    assert sorted(read) == ["occupancy", "point_tags", "points_m"]
+    recording.read_fields(recording.sequences[0], 1, {"point_classes"})
+    assert sorted(read[3:]) == ["point_tags", "points_m"]
+
+
 def test_as_many_classes_as_points_are_expected(tmp_path):
     root = writers.write_plain(tmp_path, {"train/a": 3})
     tagged(root, "train/a", 3, lambda frame, points, tags: (points, tags[:3]))

@@ -11,12 +11,13 @@ import dataclasses
 import functools
 import warnings
 from collections.abc import Callable
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import jax
 import jax.numpy as jnp
 
 from muvo_jax import config as config_lib
+from muvo_jax import limits
 from muvo_jax import run as run_lib
 from muvo_jax.agents import episodes, forks, rewards, road, uncertainty
 from muvo_jax.agents.episodes import EnvParams, EnvState, StartBank, Transition
@@ -50,7 +51,7 @@ class Environment:
 
     model: WorldModel
     contract: config_lib.ActionContract = config_lib.ActionContract()
-    periods: int = 1
+    periods: Annotated[int, limits.COUNT] = 1
     reward_config: rewards.RewardConfig = rewards.RewardConfig()
     reward_function: RewardFunction | None = None
     reward_heads: tuple[str, ...] | None = None
@@ -59,9 +60,10 @@ class Environment:
     caution: uncertainty.Caution = uncertainty.Caution()
 
     def __post_init__(self):
+        limits.check(self)
         if not isinstance(self.observation, str):
             object.__setattr__(self, "observation", tuple(self.observation))  # a list has no hash
-        if isinstance(self.observation, str) and self.observation not in OBSERVATIONS:
+        if not self.observation or (isinstance(self.observation, str) and self.observation not in OBSERVATIONS):
             raise ValueError(f"Environment: observation is {self.observation!r}, expected \"features\", \"road\" or a "
                              f"tuple of decoded heads such as (\"image\",).")
         heads = self.decoded_heads

@@ -126,6 +126,11 @@ def test_what_does_not_fit_is_refused():
         environment_lib.Environment(blind)
     with pytest.raises(ValueError, match=r"observation is 'image', expected \"features\", \"road\" or a tuple"):
         dataclasses.replace(make()[0], observation="image")
+    with pytest.raises(ValueError, match=r"observation is \(\), expected \"features\""):
+        dataclasses.replace(make()[0], observation=())
+    for periods, problem in ((0, "is 0; it must be at least 1"), (2.5, "is 2.5; expected whole numbers")):
+        with pytest.raises(ValueError, match=f"Environment.periods {problem}"):
+            dataclasses.replace(make()[0], periods=periods)
     environment, params = make()
     with pytest.raises(ValueError, match="horizon is 0"):
         make(horizon=0)

@@ -98,7 +98,10 @@ def cem(objective: Objective, key: Array, start: Array, config: PlannerConfig = 
 
 
 def mppi(objective: Objective, key: Array, start: Array, config: PlannerConfig = PlannerConfig()) -> Plan:
-    """Model-predictive path integral control: the mean of all plans, weighted by exp(return / temperature)."""
+    """Model-predictive path integral control: the mean of all plans, weighted by exp(return / temperature).
+
+    Where no plan has a finite return, the mean stays as it is.
+    """
     start = _checked(start)
 
     def iterate(mean, key):
@@ -106,11 +109,13 @@ def mppi(objective: Objective, key: Array, start: Array, config: PlannerConfig =
         noise = config.std * jax.random.normal(key_noise, (config.plans, *start.shape), jnp.float32)
         plans = jnp.clip(mean[None] + noise, -1.0, 1.0).at[0].set(mean)
         values = _finite(objective(key_value, plans))
+        # The first plan is the mean: it stays where none can be told from another.
+        values = values.at[0].set(jnp.where(jnp.isfinite(values).any(), values[0], 0.0))
         weights = jax.nn.softmax(values / config.temperature)
         return jnp.einsum("p,pha->ha", weights, plans, precision=precision.PRODUCTS), None
 
     mean, _ = jax.lax.scan(iterate, jnp.clip(start, -1.0, 1.0), jax.random.split(key, config.iterations))
-    return Plan(mean, objective(jax.random.fold_in(key, config.iterations), mean[None])[0])
+    return Plan(mean, _finite(objective(jax.random.fold_in(key, config.iterations), mean[None]))[0])
 
 
 def gradient(objective: Objective, key: Array, start: Array, config: PlannerConfig = PlannerConfig()) -> Plan:

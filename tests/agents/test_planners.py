@@ -34,6 +34,15 @@ def test_a_plan_that_gives_nan_is_never_chosen(name):
     assert -0.2 < plan.value <= 0
 
 
+@pytest.mark.parametrize("name", planners.PLANNERS)
+def test_where_no_plan_gives_a_number_the_start_stays(name):
+    start = jnp.full((3, 2), 0.25)
+    plan = planners.PLANNERS[name](lambda key, plans: jnp.full(plans.shape[0], jnp.nan), jax.random.key(0), start,
+                                   planners.PlannerConfig(plans=8, iterations=2, elites=4, starts=2))
+    np.testing.assert_array_equal(plan.actions, start)
+    assert plan.value == -jnp.inf
+
+
 def test_gradient_ascent_leaves_a_hill_and_a_plateau_by_its_other_starts():
     """A low hill at the start, nothing to climb beside it, and the high one at 0.8."""
     height = lambda at, top, width: top * jnp.maximum(1.0 - jnp.abs(at) / width, 0.0)

@@ -74,6 +74,11 @@ class PillarGrid:
 
     def __post_init__(self):
         check(self)
+        cells = 2 * self.half_side_m * self.cells_per_m
+        if abs(cells - self.cells) > 1e-6:
+            raise RangeError("PillarGrid", "cells_per_m", f"is {self.cells_per_m:g}: with half_side_m "
+                             f"{self.half_side_m:g} a side has {cells:g} cells; 2 * half_side_m * cells_per_m must be "
+                             f"a whole number.")
 
     @property
     def cells(self) -> int:

@@ -66,6 +66,7 @@ def test_a_part_is_chosen_by_its_kind_and_has_the_size_of_the_preset():
     ("model.fusion.heads", 7, "model.fusion.token_channels is 96; it must be a multiple of 4 and of heads, 7"),
     ("model.latent.occupancy_blocks", 9, "each side must be a multiple of 4096"),
     ("model.lidar.grid.cells_per_m", 1.0, "model.lidar.grid has 48 cells on a side"),
+    ("model.lidar.grid.half_side_m", 24.2, r"model.lidar.grid.cells_per_m is 2: with half_side_m 24.2 a side has 96.8"),
     ("model.camera.grid.lifted_bins", 99, "lifted_bins 99 lie between 1 and depth_bins"),
     ("data.stride", 0, "data.stride is 0; it must be at least 1"),
     ("train.steps", 0, "train.steps is 0; it must be at least 1"),

@@ -121,7 +121,7 @@ class Network(linen.Module):
 class WorldModel:
     """A frozen, hashable description of a model: pass it as a static argument under jit.
 
-    All methods are pure; `variables` is {"params": ..., "batch_stats": ...}, plain nested dictionaries.
+    All methods are pure, and all but `init` can be traced. `variables` is {"params": ..., "batch_stats": ...}, dicts.
     """
 
     config: ModelConfig
@@ -160,7 +160,7 @@ class WorldModel:
           batch: where given, checked against the configuration (shapes do not depend on it otherwise).
 
         Raises:
-          ValueError: if the batch does not fit the configuration.
+          ValueError: if the batch does not fit the configuration, or the key is traced: this runs on the host.
         """
         if batch is not None:
             self._frames(batch)

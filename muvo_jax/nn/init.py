@@ -38,7 +38,14 @@ def fill(shapes: Mapping[str, Any], key: jax.Array, constants: Mapping[str, Any]
       shapes: {"params": ..., "batch_stats": ...} with leaves that have a `shape`, as jax.eval_shape gives.
       key: typed PRNG key; each leaf depends on the key and its own path only.
       constants: path of a parameter ("decoders/image/head_1/bias") -> number or array that replaces the rule.
+
+    Raises:
+      ValueError: for a traced key, under jit, vmap or grad.
     """
+    if isinstance(key, jax.core.Tracer):
+        raise ValueError("init: got a traced key (under jit, vmap or the like), but it draws with NumPy, on the host; "
+                         "call it outside. For shapes alone use model.variable_shapes(); for several models stack what "
+                         "a loop over keys gives.")
     words = [int(word) for word in np.asarray(jax.random.key_data(key)).ravel()]
     constants = constants or {}
 

@@ -2,6 +2,7 @@
 
 import jax
 import numpy as np
+import pytest
 
 from muvo_jax.nn import init
 
@@ -21,6 +22,11 @@ SHAPES = {
     },
     "batch_stats": {"bn1": {"mean": shape(4), "var": shape(4)}},
 }
+
+
+def test_a_traced_key_is_refused_with_what_to_do_instead():
+    with pytest.raises(ValueError, match=r"init: got a traced key .*variable_shapes\(\).* loop over keys"):
+        jax.vmap(lambda key: init.fill(SHAPES, key))(jax.random.split(jax.random.key(0), 2))
 
 
 def test_rules():

@@ -230,8 +230,8 @@ class FirstGuess(linen.Module):
 
     @linen.compact
     def __call__(self, outputs: dict[int, jax.Array]) -> dict[int, jax.Array]:
-        return {scale: value + self.variable("batch_stats", f"scale_{scale}", jnp.zeros, value.shape[1:]).value[None]
-                for scale, value in outputs.items()}
+        constant = lambda scale, shape: self.variable("batch_stats", f"scale_{scale}", jnp.zeros, shape, jnp.float32)
+        return {scale: value + constant(scale, value.shape[1:]).value[None] for scale, value in outputs.items()}
 
 
 def first_guess_path(head: str) -> str:

@@ -271,7 +271,7 @@ def with_evidence(config: ModelConfig, memory: Memory | None, vantage: Vantage |
     index = jnp.broadcast_to(newest[None], (rows.shape[0], places))
     known = (index >= vantage.first[:, None]) & (index >= 0)
     index = jnp.maximum(index, 0)
-    pose = motion_ops.relative(jnp.zeros((*index.shape, 3)), memory.pose[rows[:, None], index])
+    pose = motion_ops.relative(jnp.zeros((*index.shape, 3), jnp.float32), memory.pose[rows[:, None], index])
     sight, grid = Sight(rows, index, known, pose, jnp.ones_like(rows)), _wide(config.voxels)
     evidence, hits = _evidence(config, memory, sight, grid)
     gathered = _gathered(evidence)

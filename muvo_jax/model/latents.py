@@ -76,7 +76,7 @@ class Transition(linen.Module, abc.ABC):
         self.slope = _LEAKY_SLOPE[config.numerics]
         self.pre_gru = layers.Dense(channels, compute)
         if config.action_path == "recurrence":
-            self.action_spread = self.variable("batch_stats", "action_spread", jnp.ones, (2,))
+            self.action_spread = self.variable("batch_stats", "action_spread", jnp.ones, (2,), jnp.float32)
             self.driven = layers.Dense(channels, compute)
 
     @staticmethod

@@ -39,7 +39,7 @@ def cell_flow(hits: Array, older: Array) -> Array:
     """
     farthest = LAGS * REACH_CELLS  # displacements are tried to the cell over all lags, and taken evenly between them
     sides = np.arange(-farthest, farthest + 1)
-    moves = jnp.asarray(np.stack(np.meshgrid(sides, sides, indexing="ij"), axis=-1).reshape(-1, 2))
+    moves = jnp.asarray(np.stack(np.meshgrid(sides, sides, indexing="ij"), axis=-1).reshape(-1, 2), jnp.float32)
     starts = (farthest - np.round(sides[:, None] * (np.arange(1, LAGS + 1) / LAGS))).astype(np.int32)  # by lag
     # Layers and lags first, cells along y last: the loops below then run over whole rows of cells.
     layers = jnp.moveaxis(hits, -1, 0)
@@ -61,7 +61,7 @@ def cell_flow(hits: Array, older: Array) -> Array:
     agreements = jax.lax.map(agreements_along, jnp.asarray(starts)).reshape(-1, *hits.shape[:3])
     standing = agreements[moves.shape[0] // 2]
     # Of moves that agree alike the shortest is taken.
-    best = (agreements - 0.05 * jnp.linalg.norm(moves.astype(jnp.float32), axis=-1)[:, None, None, None]).argmax(axis=0)
+    best = (agreements - 0.05 * jnp.linalg.norm(moves, axis=-1)[:, None, None, None]).argmax(axis=0)
     agreed = jnp.take_along_axis(agreements, best[None], axis=0)[0]
     moves_on = (agreed > standing + MARGIN_VOXELS) & (agreed > AGREEMENT * _block(hits.sum(axis=-1))) & (standing < 0.0)
     return jnp.where(jnp.expand_dims(moves_on, -1), moves[best] / LAGS, 0.0)

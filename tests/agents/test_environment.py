@@ -219,6 +219,15 @@ def test_what_a_reward_or_an_observation_would_miss_is_told_at_once():
         environment_lib.Environment(MODEL, reward_heads=("image",))
 
 
+def test_observations_are_float32_where_jax_counts_in_float64():
+    model = world_model.WorldModel(dataclasses.replace(
+        CONFIG, heads=("image", "action"), first_guess=config_lib.TrainingMean(), range_scale_m=49.0))
+    with jax.enable_x64(True):
+        shapes = environment_lib.Environment(model, reward_config=NO_COLLISION, observation=("image",)
+                                             ).observation_shapes
+    assert shapes["image"].dtype == jnp.float32
+
+
 def test_a_reward_of_plain_numbers_is_one():
     environment = environment_lib.Environment(MODEL, periods=2, reward_heads=(),
                                               reward_function=lambda moment: (1, False, {}))

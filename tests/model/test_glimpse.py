@@ -11,7 +11,7 @@ from muvo_jax import config as config_lib
 from muvo_jax import head, presets
 from muvo_jax.heads import image as image_head
 from muvo_jax.heads import range_view as range_view_head
-from muvo_jax.model import glimpse, memory
+from muvo_jax.model import glimpse, memory, world_model
 from muvo_jax.ops import range_view, reproject
 from muvo_jax.types import Memory, Motion, Vantage
 
@@ -79,6 +79,17 @@ def test_evidence_worked_out_once_shows_the_same(steps):
         np.testing.assert_allclose(once.onward, direct.onward, atol=1e-4)
     else:
         assert not once.onward.any()  # too far ahead to say
+
+
+def test_variables_and_evidence_are_float32_where_jax_counts_in_float64():
+    config = dataclasses.replace(CONFIG, action_path="recurrence", kinematics=config_lib.Kinematics(),
+                                 range_scale_m=49.0)  # whose shapes nobody has asked for
+    narrow = lambda tree: {leaf.dtype.itemsize for leaf in jax.tree.leaves(tree)} <= {1, 2, 4}
+    seen = jax.eval_shape(lambda: (memory_of((2.0, 6.0), 1.0), vantage_of(0)))
+    with jax.enable_x64(True):
+        shapes = world_model.WorldModel(config).variable_shapes()
+        assert {"transition", "first_guess_range_view"} <= shapes["batch_stats"].keys() and narrow(shapes)
+        assert narrow(jax.eval_shape(lambda seen, vantage: glimpse.with_evidence(config, seen, vantage), *seen))
 
 
 def test_returns_in_the_middle_of_pixels_are_told_from_returns_anywhere():

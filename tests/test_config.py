@@ -79,6 +79,30 @@ def test_bad_values_are_refused_with_the_reason(field, value, message):
         config_lib.override(town, field, value)
 
 
+@pytest.mark.parametrize(("changes", "message"), [
+    ({"model.decoder_channels": 7},
+     "model.decoder_channels is 7; it must be at least 8 with the heads image, range_view"),
+    ({"model.occupancy_channels": 4}, "model.occupancy_channels is 4; it must be at least 8 with the head occupancy"),
+    ({"model.measurement_channels": 1, "model.navigation": True},
+     "model.measurement_channels is 1; it must be at least 2 with navigation"),
+    ({"model.backbone": "mobilevitv2_100", "model.backbone_width": 1},
+     "model.backbone_width is 1; it must be at least 2 with backbone mobilevitv2_100"),
+    ({"model.first_guess": config_lib.LastSeen(2, (8, 1, 8))},
+     r"model.first_guess.guided_channels is \(8, 1, 8\); it must be at least 2 for each of the heads range_view"),
+])
+def test_widths_that_leave_no_channel_are_refused(changes, message):
+    with pytest.raises(ValueError, match=message):
+        config_lib.override_all(presets.get("tiny"), changes)
+
+
+def test_widths_that_nothing_divides_may_be_one():
+    narrow = {"model.decoder_channels": 1, "model.occupancy_channels": 1, "model.measurement_channels": 1,
+              "model.backbone_width": 1}
+    for name, value in (("heads", ("action",)), ("first_guess", config_lib.LastSeen(2, (2, 2, 2)))):
+        config = config_lib.override_all(presets.get("tiny"), narrow | {f"model.{name}": value})
+        assert (getattr(config.model, name), config.model.decoder_channels) == (value, 1)
+
+
 def test_settings_of_a_sensor_that_the_model_does_not_see_are_refused():
     blind = config_lib.override(presets.get("tiny"), "model.camera", "none")
     with pytest.raises(ValueError, match=r"model.camera.grid is a setting of model.camera=bev .*model.camera is none"):

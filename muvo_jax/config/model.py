@@ -24,9 +24,11 @@ from muvo_jax.config.parts import (
     ZeroGuess,
 )
 from muvo_jax.geometry import RangeViewGeometry, VoxelGrid
-from muvo_jax.limits import COUNT, SHARE, Limits, above, check
+from muvo_jax.limits import COUNT, SHARE, Limits, RangeError, above, check
 
 BACKBONES = ("resnet18", "mobilevitv2_100")
+_DRAWN = ("image", "range_view", "depth", "semantic_image", "semantic_range_view", "birds_eye")  # decoder_channels wide
+_GUIDED = ("image", "range_view", "occupancy")  # in the order of LastSeen.guided_channels
 
 
 @dataclasses.dataclass(frozen=True)
@@ -140,10 +142,33 @@ class ModelConfig:
         if self.range_view.rows % 32 or self.range_view.columns % 32:
             raise ValueError(f"model.range_view is {self.range_view.rows}x{self.range_view.columns}: rows and columns "
                              f"must be multiples of 32.")
+        self._check_widths()
         if isinstance(self.latent, TokenLatent):
             self._check_tokens(self.latent)
         elif not {"occupancy", "birds_eye"}.isdisjoint(self.heads):
             self._check_voxels("occupancy_blocks", self.latent.occupancy_blocks)
+
+    def _check_widths(self) -> None:
+        """Some layers have a half or an eighth of a width; that must leave a channel."""
+        guess, heads = self.first_guess, self.heads
+        guided: dict[str, int] = {}
+        if isinstance(guess, LastSeen) and self.lidar is not None:
+            guided = dict(zip(_GUIDED, guess.guided_channels, strict=True))
+            if self.camera is None:
+                del guided["image"]
+        drawn = [head for head in heads if head in _DRAWN and head not in guided]
+        for field, least, needed, reason in (
+                ("decoder_channels", 8, drawn, f"the heads {', '.join(drawn)}"),
+                ("occupancy_channels", 8, "occupancy" in heads and "occupancy" not in guided, "the head occupancy"),
+                ("measurement_channels", 2, self.navigation, "navigation"),
+                ("backbone_width", 2, self.backbone == "mobilevitv2_100", f"backbone {self.backbone}")):
+            if needed and getattr(self, field) < least:
+                raise RangeError("ModelConfig", field, f"is {getattr(self, field)}; it must be at least {least} with "
+                                 f"{reason}.")
+        narrow = [head for head in heads if guided.get(head, 2) < 2]
+        if isinstance(guess, LastSeen) and narrow:
+            raise RangeError("ModelConfig", "first_guess.guided_channels", f"is {guess.guided_channels}; it must be at "
+                             f"least 2 for each of the heads {', '.join(narrow)}.")
 
     def _check_tokens(self, latent: TokenLatent) -> None:
         if not isinstance(self.fusion, TransformerFusion):

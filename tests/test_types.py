@@ -2,6 +2,7 @@
 
 import copy
 import pickle
+import re
 
 import jax
 import jax.numpy as jnp
@@ -30,6 +31,16 @@ def test_validate_names_the_field():
     with pytest.raises(ValueError, match=r"Batch.speed_mps: leading axes \(2, 4\)"):
         batch(speed_mps=np.zeros((2, 4), np.float32)).validate()
     assert batch().validate() is not None
+
+
+@pytest.mark.parametrize(("name", "shape", "expected"), [
+    ("action", (2, 5, 3), "2"), ("ego_motion", (2, 5, 3), "4"), ("points", (2, 5, 9, 4), "3"),
+    ("range_view", (2, 5, 4, 8, 3), "4"), ("target_m", (2, 5, 3), "2"), ("intrinsics", (2, 3, 4), "3, 3"),
+    ("camera_to_ego", (2, 3, 4), "4, 4")])
+def test_last_axes_that_are_the_same_everywhere_are_checked(name, shape, expected):
+    message = re.escape(f"Batch.{name}: got {list(shape)}, expected [..., {expected}]")
+    with pytest.raises(ValueError, match=message):
+        batch().replace(**{name: np.zeros(shape, np.float32)}).validate()
 
 
 def test_latent_states_index_like_arrays_and_put_h_first():

@@ -100,7 +100,7 @@ class Batch(Indexable):
         return dataclasses.replace(self, **timed)
 
     def validate(self) -> Batch:
-        """Checks dtypes, ranks and common prefixes (static under jit).
+        """Checks dtypes, ranks, common prefixes and the last axes that are the same everywhere (static under jit).
 
         Raises:
           ValueError: naming the field, what came and what was expected.
@@ -112,6 +112,10 @@ class Batch(Indexable):
             if value.dtype != dtype or value.ndim != rank:
                 raise ValueError(f"Batch.{name}: got {value.dtype}{list(value.shape)}, expected {np.dtype(dtype).name} "
                                  f"with {rank} axes (see muvo_jax.types.Batch).")
+            last = LAST_AXES.get(name, ())
+            if value.shape[rank - len(last):] != last:
+                raise ValueError(f"Batch.{name}: got {list(value.shape)}, expected [..., "
+                                 f"{', '.join(map(str, last))}] (see muvo_jax.types.Batch).")
             prefix = 1 if name in UNTIMED_FIELDS else 2
             if value.shape[:prefix] != self.action.shape[:prefix]:
                 raise ValueError(f"Batch.{name}: leading axes {value.shape[:prefix]} differ from those of action, "
@@ -130,4 +134,8 @@ BATCH_FIELDS = {  # dtype, rank
     "birds_eye_classes": (np.uint8, 4), "birds_eye_instances": (np.int32, 4),
     "is_terminal": (np.bool_, 2), "ego_motion": (np.float32, 3), "intrinsics": (np.float32, 3),
     "camera_to_ego": (np.float32, 3),
+}
+LAST_AXES = {  # where no configuration changes them
+    "action": (2,), "image": (3,), "range_view": (4,), "points": (3,), "route_map": (64, 64), "target_m": (2,),
+    "next_target_m": (2,), "ego_motion": (4,), "intrinsics": (3, 3), "camera_to_ego": (4, 4),
 }

@@ -173,13 +173,19 @@ def _ranges(config: ModelConfig, memory: Memory, sight: Sight) -> RangeGlimpse:
 def _image(config: ModelConfig, memory: Memory, sight: Sight, view: RangeGlimpse) -> ImageGlimpse:
     assert memory.image is not None and memory.intrinsics is not None and memory.camera_to_ego is not None  # see check
     images, rows = memory.image.reshape(-1, *memory.image.shape[2:]), sight.rows
-    moved, inside = reproject.move_image(images, view.filled_m, sight.pose[:, -1], memory.intrinsics[rows],
-                                         memory.camera_to_ego[rows], config.range_view,
-                                         rows * memory.image.shape[1] + sight.places[:, -1])
+    intrinsics, camera_to_ego = (_calibration(given)[rows] for given in (memory.intrinsics, memory.camera_to_ego))
+    moved, inside = reproject.move_image(images, view.filled_m, sight.pose[:, -1], intrinsics, camera_to_ego,
+                                         config.range_view, rows * memory.image.shape[1] + sight.places[:, -1])
     known = sight.known[:, -1].astype(jnp.float32).reshape(-1, 1, 1, 1)
     covered = jnp.where(jnp.expand_dims(inside, -1), 1.0, EDGE) * known
     colour = memory.image.astype(jnp.float32).mean(axis=(2, 3))[rows, sight.places[:, -1]].reshape(-1, 1, 1, 3)
     return ImageGlimpse(image=moved / 255.0 * covered, covered=covered, colour=colour / 255.0 * known)
+
+
+def _calibration(matrices: Array) -> Array:
+    """Matrices [B, k, k], with the identity for those of zeros: a stream has no camera before its first observation."""
+    none = (matrices == 0.0).all(axis=(1, 2), keepdims=True)
+    return jnp.where(none, jnp.eye(matrices.shape[-1], dtype=matrices.dtype)[None], matrices)
 
 
 def _voxels(config: ModelConfig, memory: Memory, sight: Sight) -> VoxelGlimpse:

@@ -318,6 +318,24 @@ def test_without_kinematics_measured_motion_counts():
                     {head: value[:, t] for head, value in whole.items()})
 
 
+def test_before_its_first_observation_a_stream_shows_the_average_frame():
+    model = model_of()
+    begun = live.start_live(model, KEY)
+    zeros = jax.tree.map(jnp.zeros_like, (begun.latent, begun.memory))  # what a sealed model's consumer starts from
+
+    @jax.jit
+    def image(variables, latent, seen):
+        of = lambda latent: rollout.decode(model, variables, latent, ("image",), memory=seen).image
+        slopes = jax.grad(lambda motion: of(dataclasses.replace(
+            latent, vantage=dataclasses.replace(latent.vantage, motion=motion))).sum())(latent.vantage.motion)
+        return of(latent), slopes
+
+    for latent, seen in ((begun.latent, begun.memory), zeros):
+        shown, slopes = image(fresh(model), latent, seen)
+        np.testing.assert_allclose(shown, 0.3, atol=1e-5)
+        assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(slopes))
+
+
 def test_evidence_worked_out_once_says_nearly_the_same_and_only_of_what_is_imagined_from_the_newest_observation():
     model = model_of()
     batch = batch_of(model.config, speed_mps=6.0)

@@ -155,8 +155,22 @@ def observation(where: str, model: WorldModel, batch: Batch) -> None:
     read = {"action": batch.action, "range_view": batch.range_view}
     read |= {name: getattr(batch, name) for name in inputs(model.config)}
     finite(where, **{name: value for name, value in read.items() if value is not None})
+    arrivals(where, model, batch.ego_motion, batch.is_first)
     for name in ("command", "next_command"):
         known_commands(where, name, read.get(name))
+
+
+def arrivals(where: str, model: WorldModel, given, is_first) -> None:
+    """Raises ValueError where ego motion [..., 4] that moves the model's memory is concrete and not finite.
+
+    None and traced values pass, and how the car came to a frame that `is_first` [...] may be anything.
+    """
+    moves = model.config.tracks_motion and model.config.kinematics is None
+    if given is None or not moves or isinstance(given, jax.core.Tracer) or np.isfinite(given).all():
+        return  # before `is_first` is looked at: in a stream it lies on the device
+    if not isinstance(is_first, jax.core.Tracer):
+        unknown = np.expand_dims(np.asarray(is_first), -1) & (np.arange(4) < 3)
+        _finite(where, {"ego_motion": np.where(unknown, np.float32(0.0), np.asarray(given))})
 
 
 def known_commands(where: str, name: str, given) -> None:

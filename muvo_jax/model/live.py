@@ -78,6 +78,8 @@ def observe_step(model: WorldModel, variables: Variables, live: LiveState, obser
     batch.validate()
     checks.finite_on_host("observe_step", state=live.latent, **{
         name: value for name, value in observation.items() if name in {*inputs(model.config), "range_view"}})
+    if not isinstance(given := observation.get("ego_motion"), jax.Array):
+        checks.arrivals("observe_step", model, given, live.frame == 0)
     for name in ("command", "next_command"):
         if not isinstance(given := observation.get(name), jax.Array):
             checks.known_commands("observe_step", name, given)

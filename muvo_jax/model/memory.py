@@ -17,7 +17,7 @@ import numpy as np
 from muvo_jax import head as head_lib
 from muvo_jax.config import KNOWN_HEADS, LastSeen, ModelConfig
 from muvo_jax.ops import motion as motion_ops
-from muvo_jax.types import UNTIMED_FIELDS, Array, Batch, LatentState, Memory, Motion, Vantage
+from muvo_jax.types import UNTIMED_FIELDS, Array, ArrayLike, Batch, LatentState, Memory, Motion, Vantage
 
 
 def guessed_heads(config: ModelConfig) -> tuple[str, ...]:
@@ -87,12 +87,16 @@ def measured(config: ModelConfig, batch: Batch) -> Motion | None:
         kinematics = config.kinematics
         steps = motion_ops.drive(standing, jnp.asarray(batch.action), kinematics.contract, kinematics.periods)
         return Motion(steps.pose, standing.speed_mps)
-    return None if batch.ego_motion is None else from_arrivals(jnp.asarray(batch.ego_motion))
+    return None if batch.ego_motion is None else from_arrivals(jnp.asarray(batch.ego_motion), batch.is_first)
 
 
-def from_arrivals(ego_motion: Array) -> Motion:
-    """Batch.ego_motion [B, T, 4], which says how the car came to each frame, as the motion from each frame on."""
-    onward = jnp.concatenate([ego_motion[:, 1:, :3], jnp.zeros_like(ego_motion[:, :1, :3])], axis=1)
+def from_arrivals(ego_motion: Array, is_first: ArrayLike) -> Motion:
+    """Batch.ego_motion [B, T, 4], which says how the car came to each frame, as the motion from each frame on.
+
+    How it came to a frame that `is_first` [B, T] is not known, and counts as no motion: nobody looks across that cut.
+    """
+    arrivals = jnp.where(jnp.expand_dims(is_first, -1), 0.0, ego_motion[..., :3])
+    onward = jnp.concatenate([arrivals[:, 1:], jnp.zeros_like(arrivals[:, :1])], axis=1)
     return Motion(onward, ego_motion[..., 3])
 
 
@@ -142,8 +146,9 @@ def empty(config: ModelConfig, batch_size: int) -> Memory | None:
 def remember(memory: Memory, batch: Batch, step: Array) -> Memory:
     """With one more observation (a batch of one frame), the oldest one forgotten.
 
-    step: float32 [B, 3], where the car stands in the ego frame of the observation before.
+    step: float32 [B, 3], where the car stands in the ego frame of the observation before; nowhere at the first one.
     """
+    step = jnp.where(batch.is_first, 0.0, step)
     append = lambda old, new: jnp.concatenate([old[:, 1:], jnp.asarray(new).astype(old.dtype)], axis=1)
     poses = motion_ops.relative(memory.pose, jnp.broadcast_to(step[:, None], memory.pose.shape))
     memory = dataclasses.replace(memory, pose=append(poses, jnp.zeros_like(step)[:, None]),

@@ -122,7 +122,7 @@ def observe_window(model: WorldModel, variables: Variables, batch: Batch, keys: 
     observed = filter_embeddings(model, variables, embedding, batch.action, batch.is_first, noise,
                                  None if moved is None else moved.speed_mps, remat=remat)
     if model.config.tracks_motion:
-        moved = moved or memory_lib.from_arrivals(model.ego_motion(variables, observed.states))
+        moved = moved or memory_lib.from_arrivals(model.ego_motion(variables, observed.states), batch.is_first)
         states, remembered = memory_lib.of_window(model.config, batch, observed.states, moved)
         observed = dataclasses.replace(observed, states=states, memory=remembered)
     return observed, batch_stats

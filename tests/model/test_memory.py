@@ -14,7 +14,7 @@ from muvo_jax import config as config_lib
 from muvo_jax import presets
 from muvo_jax.agents import environment as environment_lib
 from muvo_jax.agents import planners, rewards
-from muvo_jax.model import glimpse, live, memory, rollout, world_model
+from muvo_jax.model import checks, glimpse, live, memory, rollout, world_model
 from muvo_jax.ops import camera, motion, range_view, reproject
 from muvo_jax.types import Batch, LatentState
 
@@ -316,6 +316,45 @@ def test_without_kinematics_measured_motion_counts():
     for t, stream in enumerate(stream_of(model, variables, batch, ("ego_motion",))):
         assert_same(decode(model, variables, stream, stream.latent, SCANNED),
                     {head: value[:, t] for head, value in whole.items()})
+
+
+def test_how_the_car_came_to_a_first_frame_may_be_anything():
+    config = config_of("1d", "none", heads=SCANNED).model
+    ego_motion = np.random.default_rng(2).uniform(0.0, 1.0, (BATCH, FRAMES, 4)).astype(np.float32)
+    cut = np.broadcast_to(np.arange(FRAMES) % 2 == 0, (BATCH, FRAMES)).copy()
+    unknown = ego_motion.copy()
+    unknown[:, ::2, :3] = np.nan
+    states = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf[:, None], (BATCH, FRAMES, *leaf.shape[1:])),
+                          model_of("1d", "none", heads=SCANNED).initial_state(BATCH))
+
+    def poses(batch):
+        seen, kept = memory.of_window(config, batch, states, memory.measured(config, batch))
+        return seen.vantage.motion, kept.pose
+
+    batch = batch_of(config, is_first=cut, ego_motion=unknown)
+    moved, kept = jax.jit(poses)(batch)
+    np.testing.assert_allclose(motion.relative(kept[:, 1], kept[:, 0]), ego_motion[:, 1, :3], atol=1e-5)
+    np.testing.assert_allclose(moved.pose[:, 2], kept[:, 2])
+    assert np.isfinite(kept).all() and np.isfinite(moved.pose).all()
+    model, other = model_of("1d", "none", heads=SCANNED), model_of()
+    checks.observation("observe", model, batch)
+    for field in (0, 3):  # the motion to a frame that is not first, and a speed
+        wrong = unknown.copy()
+        wrong[0, 1 if field == 0 else 2, field] = np.inf
+        with pytest.raises(ValueError, match=r"observe: ego_motion \[2, 4, 4\] holds 1 values that are not finite"):
+            checks.observation("observe", model, batch.replace(ego_motion=wrong))
+    checks.observation("observe", other, batch_of(other.config, ego_motion=wrong))  # which does not read it
+
+
+def test_a_stream_takes_any_motion_to_its_first_frame_and_finite_motion_afterwards():
+    model = model_of("1d", "none", heads=SCANNED)
+    nowhere = np.full((BATCH, 2, 4), np.nan, np.float32)
+    nowhere[:, 0, 3] = 5.0
+    batch = batch_of(model.config, frames=2, ego_motion=nowhere)
+    stream = stream_of(model, trained(model), batch, ("ego_motion",))
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(dataclasses.replace(next(stream), keys=None)))
+    with pytest.raises(ValueError, match=r"observe_step: ego_motion \[2, 4\] holds 8 values that are not finite"):
+        next(stream)
 
 
 def test_before_its_first_observation_a_stream_shows_the_average_frame():

@@ -151,7 +151,11 @@ def _finite(where: str, named: dict) -> None:
 
 
 def observation(where: str, model: WorldModel, batch: Batch) -> None:
-    """Raises ValueError where an input of the model, or an action, is concrete and not finite, or no known command."""
+    """Raises ValueError where an input of the model, or an action, is concrete and not finite, or no known command;
+    also for a batch without windows or frames."""
+    if not (batch.batch_size and batch.frames):
+        raise ValueError(f"{where}: got a batch of {batch.batch_size} windows of {batch.frames} frames, expected at "
+                         f"least one of both.")
     read = {"action": batch.action, "range_view": batch.range_view}
     read |= {name: getattr(batch, name) for name in inputs(model.config)}
     finite(where, **{name: value for name, value in read.items() if value is not None})

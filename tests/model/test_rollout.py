@@ -253,6 +253,12 @@ def test_bad_input_is_refused(variables, state, arguments, message):
         rollout.imagine(MODEL, variables, **{"key": jax.random.key(0), "state": state} | arguments)
 
 
+def test_a_batch_of_nothing_is_refused():
+    for batch, came in ((make_batch()[:0], "0 windows of 3"), (make_batch().time_slice(0, 0), "2 windows of 0")):
+        with pytest.raises(ValueError, match=f"observe: got a batch of {came} frames, expected at least one"):
+            rollout.observe(MODEL, {}, jax.random.key(0), batch)
+
+
 def test_a_dream_from_every_frame_is_the_dream_from_each(variables, actions):
     observed = rollout.observe(MODEL, variables, jax.random.key(5), make_batch(frames=HORIZON))
     plans = jnp.stack([actions] * HORIZON, axis=1)  # [B, T, H, 2]

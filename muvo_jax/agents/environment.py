@@ -177,6 +177,7 @@ class Environment:
         """
         episodes.check(self.model, bank)
         checks.counts(horizon, None, "params")
+        checks.scalar("params", temperature=temperature)
         checks.finite("params", temperature=temperature)
         if self.trained_steps is not None and horizon > self.trained_steps and not isinstance(
                 bank.speed_mps, jax.core.Tracer):

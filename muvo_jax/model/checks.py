@@ -115,6 +115,14 @@ def chosen_actions(given, where: str) -> None:
                          f"lower its learning rate.")
 
 
+def scalar(where: str, **named) -> None:
+    """Raises ValueError where a value, traced or not, is more than one number."""
+    for name, value in named.items():
+        if jnp.shape(value) != ():
+            raise ValueError(f"{where}: got {name} {list(jnp.shape(value))}, expected one number for all; for one of "
+                             f"each state map the call, jax.vmap(lambda state, {name}: ...).")
+
+
 def finite(where: str, **named) -> None:
     """Raises ValueError where a concrete array holds NaN or infinity, naming it; traced values and integers pass.
 

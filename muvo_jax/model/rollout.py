@@ -169,7 +169,7 @@ def imagine(model: WorldModel, variables: Variables, key: jax.Array, state: Late
       horizon: H; needed with a policy, otherwise checked.
       branches: N futures of each state; results have the axes [*L, N, H, ...]. Inferred from actions that have them.
       sampled: sample the latents; otherwise take their means.
-      temperature: factor on the standard deviation of the latents where sampled; may be traced.
+      temperature: factor on the standard deviation of the latents where sampled, one number; may be traced.
       same_noise: all branches of a state draw the same noise, so that they differ by their actions alone.
 
     Raises:
@@ -188,6 +188,7 @@ def imagine(model: WorldModel, variables: Variables, key: jax.Array, state: Late
         branches, horizon = checks.actions(actions_or_policy, lead, horizon, branches)
         driver = driver.reshape(count, *driver.shape[len(lead):])
     horizon = checks.counts(horizon, branches)
+    checks.scalar("imagine", temperature=temperature)
     checks.finite("imagine", state=state, temperature=temperature)
     flat = jax.tree.map(lambda leaf: leaf.reshape(count, *leaf.shape[len(lead):]), state)
     dream = _imagine(model, variables, keys, flat, driver, jnp.float32(temperature), horizon, branches, sampled,
@@ -217,6 +218,7 @@ def imagine_step(model: WorldModel, variables: Variables, key: jax.Array, state:
     """
     lead = checks.state(model, state)
     action = checks.one_action(action, lead, "imagine_step")
+    checks.scalar("imagine_step", temperature=temperature)
     checks.finite_on_host("imagine_step", state=state, temperature=temperature)
     keys = _keys_of(key, lead)
     flat = jax.tree.map(lambda leaf: leaf.reshape(len(keys), *leaf.shape[len(lead):]), state)

@@ -247,6 +247,8 @@ def test_misfits_are_refused(variables, state, arguments, message):
     ({"actions_or_policy": np.zeros((BATCH, 3, 2), np.float32), "state": LatentState(np.zeros((2, 16)),
                                                                                      np.zeros((2, 9)))},
      r"state.stochastic: got \[2, 9\], expected \[..., 8\]"),
+    ({"actions_or_policy": np.zeros((BATCH, 3, 2), np.float32), "temperature": jnp.ones(8)},
+     r"imagine: got temperature \[8\], expected one number for all; .* jax.vmap"),
 ])
 def test_bad_input_is_refused(variables, state, arguments, message):
     with pytest.raises(ValueError, match=message):
@@ -257,6 +259,16 @@ def test_a_batch_of_nothing_is_refused():
     for batch, came in ((make_batch()[:0], "0 windows of 3"), (make_batch().time_slice(0, 0), "2 windows of 0")):
         with pytest.raises(ValueError, match=f"observe: got a batch of {came} frames, expected at least one"):
             rollout.observe(MODEL, {}, jax.random.key(0), batch)
+
+
+def test_a_temperature_for_each_state_is_mapped(variables, state, actions):
+    dream = lambda state, actions, temperature: rollout.imagine(
+        MODEL, variables, jax.random.key(1), state, actions, temperature=temperature).states.stochastic
+    cold, warm = jax.vmap(dream)(state, actions, jnp.float32([0.0, 1.0]))
+    assert_close(cold, dream(state[0], actions[0], 0.0))
+    assert_close(warm, dream(state[1], actions[1], 1.0))
+    with pytest.raises(ValueError, match=r"imagine_step: got temperature \[2\]"):
+        rollout.imagine_step(MODEL, variables, jax.random.key(1), state, actions[:, 0], temperature=jnp.ones(2))
 
 
 def test_a_dream_from_every_frame_is_the_dream_from_each(variables, actions):

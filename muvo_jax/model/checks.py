@@ -21,7 +21,8 @@ def state(model: WorldModel, latent: LatentState) -> tuple[int, ...]:
     """Returns the leading axes of a latent state.
 
     Raises:
-      ValueError: if its last axes are not those of this model, or both parts have other leading axes.
+      ValueError: if its last axes are not those of this model, both parts have other leading axes, or one is not
+        float32 (it is whatever dtype the model computes in).
     """
     expected = jax.tree.map(lambda leaf: leaf.shape[1:], jax.eval_shape(lambda: model.initial_state(1)))
     leads = []
@@ -30,6 +31,9 @@ def state(model: WorldModel, latent: LatentState) -> tuple[int, ...]:
         if shape[len(shape) - len(tail):] != tail:
             raise ValueError(f"state.{name}: got {list(shape)}, expected [{', '.join(map(str, ('...', *tail)))}]; this "
                              f"state belongs to another model.")
+        if (dtype := jnp.result_type(getattr(latent, name))) != jnp.float32:
+            raise ValueError(f"state.{name}: got {dtype}{list(shape)}, expected float32; cast it, "
+                             f"state.replace({name}=state.{name}.astype(\"float32\")).")
         leads.append(shape[:len(shape) - len(tail)])
     vantage = latent.vantage
     if model.config.tracks_motion and vantage is None:

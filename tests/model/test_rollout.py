@@ -247,6 +247,9 @@ def test_misfits_are_refused(variables, state, arguments, message):
     ({"actions_or_policy": np.zeros((BATCH, 3, 2), np.float32), "state": LatentState(np.zeros((2, 16)),
                                                                                      np.zeros((2, 9)))},
      r"state.stochastic: got \[2, 9\], expected \[..., 8\]"),
+    ({"actions_or_policy": np.zeros((BATCH, 3, 2), np.float32),
+      "state": LatentState(jnp.zeros((2, 16), jnp.bfloat16), np.zeros((2, 8), np.int32))},
+     r"state.deterministic: got bfloat16\[2, 16\], expected float32; cast it, state.replace\(deterministic="),
     ({"actions_or_policy": np.zeros((BATCH, 3, 2), np.float32), "temperature": jnp.ones(8)},
      r"imagine: got temperature \[8\], expected one number for all; .* jax.vmap"),
 ])

@@ -17,6 +17,7 @@ import jax.numpy as jnp
 from muvo_jax.model import checks
 from muvo_jax.model import memory as memory_lib
 from muvo_jax.model.world_model import WorldModel
+from muvo_jax.nn import layers
 from muvo_jax.types import ArrayLike, Batch, Dream, LatentState, Memory, Observed, Predictions, StepNoise, Variables
 
 Policy = Callable[[jax.Array, jax.Array], jax.Array]
@@ -90,7 +91,7 @@ def filter_embeddings(model: WorldModel, variables: Variables, embedding: jax.Ar
 
     inputs = jax.tree.map(_swap_time, (noise, previous, embedding, is_first, speed_mps))
     scanned = jax.checkpoint(step, prevent_cse=False) if remat else step
-    _, outputs = jax.lax.scan(scanned, model.initial_state(embedding.shape[0]), inputs)
+    _, outputs = jax.lax.scan(scanned, layers.varying_as(model.initial_state(embedding.shape[0]), inputs), inputs)
     deterministic, prior, posterior = jax.tree.map(_swap_time, outputs)
     return Observed(LatentState(deterministic, posterior.sample(noise.posterior)), posterior, prior)
 
@@ -327,6 +328,7 @@ def _imagine_flat(model, variables, keys_noise, keys_policy, state, driver, *, t
         return state, (state, action, prior)
 
     actions = None if callable(driver) else _swap_time(driver)
+    state = layers.varying_as(state, (keys_noise, keys_policy, driver, temperature))
     _, outputs = jax.lax.scan(step, state, (jnp.arange(horizon), actions))
     states, actions, prior = jax.tree.map(_swap_time, outputs)
     return Dream(states, actions, prior)

@@ -196,4 +196,4 @@ class TransformerDecoder(_Stack):
         params = self.variables["params"]
         stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *(params[name] for name in names))
         sites = first_site + SITES_PER_DECODER_LAYER * jnp.arange(self.layers_count)
-        return jax.lax.scan(step, x, (stacked, sites))[0]
+        return jax.lax.scan(step, layers.varying_as(x, (memory, keys)), (stacked, sites))[0]

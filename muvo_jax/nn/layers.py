@@ -8,7 +8,9 @@ the usual `module.init` slow to compile).
 from __future__ import annotations
 
 import dataclasses
+import functools
 import math
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -46,6 +48,15 @@ def shape_only(key: jax.Array, shape: tuple[int, ...]) -> jax.Array:
 def per_channel(vector: jax.Array, rank: int) -> jax.Array:
     """[C] -> [1, ..., 1, C] with `rank` axes."""
     return vector.reshape((1,) * (rank - 1) + (-1,))
+
+
+def varying_as(carry: Any, given: Any) -> Any:
+    """The same carry of a scan, over those axes of a mesh, too, over which something given varies.
+
+    Inside of jax.shard_map a carry must be as a step returns it; elsewhere this is the carry as it is.
+    """
+    never = functools.reduce(jnp.logical_or, [jnp.zeros_like(leaf, bool, shape=()) for leaf in jax.tree.leaves(given)])
+    return jax.tree.map(lambda leaf: jnp.where(never, leaf, leaf), carry)
 
 
 def spread(vector: jax.Array, rank: int) -> jax.Array:

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from muvo_jax import config as config_lib
 from muvo_jax import presets
 from muvo_jax.model import checks, rollout, world_model
 from muvo_jax.types import Batch, LatentState
@@ -272,6 +273,29 @@ def test_a_temperature_for_each_state_is_mapped(variables, state, actions):
     assert_close(warm, dream(state[1], actions[1], 1.0))
     with pytest.raises(ValueError, match=r"imagine_step: got temperature \[2\]"):
         rollout.imagine_step(MODEL, variables, jax.random.key(1), state, actions[:, 0], temperature=jnp.ones(2))
+
+
+@pytest.mark.parametrize("latent", ["1d", "2d"])
+def test_windows_and_dreams_are_shared_by_devices(latent):
+    """Under jax.shard_map as it is by default, which checks over which axes of the mesh a value varies."""
+    config = config_lib.override_all(presets.get("tiny"), {
+        "model.latent": latent, "model.camera": "none", "model.route": False, "model.heads": ("action",)})
+    model, batch = world_model.WorldModel(config.model), make_batch().replace(image=None, route_map=None)
+    mesh = jax.make_mesh((2,), ("data",), axis_types=(jax.sharding.AxisType.Auto,))
+    each = jax.sharding.PartitionSpec("data")
+
+    def both(variables, keys, batch):
+        observed = rollout.observe(model, variables, keys, batch)
+        start = model.initial_state(batch.batch_size)  # the same on every device, unlike what follows
+        return observed.states, rollout.imagine(model, variables, keys, start, batch.action).states
+
+    shared = jax.shard_map(both, mesh=mesh, in_specs=(jax.sharding.PartitionSpec(), each, each), out_specs=each)
+    keys = jax.random.split(jax.random.key(1), BATCH)
+    shapes = jax.eval_shape(shared, model.variable_shapes(), keys, batch)
+    assert shapes == jax.eval_shape(both, model.variable_shapes(), keys, batch)
+    if latent == "1d":
+        variables = model.init(jax.random.key(0))
+        assert_close(jax.jit(shared)(variables, keys, batch), jax.jit(both)(variables, keys, batch))
 
 
 def test_a_dream_from_every_frame_is_the_dream_from_each(variables, actions):

@@ -76,8 +76,9 @@ def batch_moments(x: jax.Array, axis_name: str | None,
     divisor = count if mask is None else jnp.maximum(count, 1.0)
     mean = over_rows(x) / divisor
     # The derivative of the squares by the mean is sum(x - mean) = 0: leaving it out saves a reduction backwards.
-    centre = layers.per_channel(jax.lax.stop_gradient(mean), x.ndim)
-    squares = over_rows(jnp.square(x - centre))
+    # What is taken off the squares is 0, and so is its slope; its curvature is what second derivatives need.
+    centre = jax.lax.stop_gradient(mean)
+    squares = over_rows(jnp.square(x - layers.per_channel(centre, x.ndim))) - count * jnp.square(mean - centre)
     return mean, squares / divisor, squares / jnp.maximum(count - 1.0, 1.0), count
 
 

@@ -29,6 +29,22 @@ def test_training_normalises_by_the_biased_and_stores_the_unbiased_variance():
     np.testing.assert_allclose(updated["batch_stats"]["var"], [0.9 * 3 + 0.1 * 14 / 3], rtol=1e-6)
 
 
+def test_second_derivatives_are_those_of_the_arithmetic():
+    weights = jnp.arange(1.0, 7.0).reshape(3, 2)
+    variables = {"params": {"scale": jnp.ones(2), "bias": jnp.zeros(2)},
+                 "batch_stats": {"mean": jnp.zeros(2), "var": jnp.ones(2)}}
+    layer = lambda x: jnp.sum(apply(variables, x, norm.Mode(train=True))[0] ** 3 * weights)
+
+    def by_hand(x):
+        centred = x - x.mean(axis=0, keepdims=True)
+        return jnp.sum((centred / jnp.sqrt((centred**2).mean(axis=0, keepdims=True) + 1e-5)) ** 3 * weights)
+
+    x = jnp.float32([[0, 1], [2, 5], [3, 4]])
+    got, want = (jax.jit(lambda x, of=of: (jax.grad(of)(x), jax.jacrev(jax.grad(of))(x)))(x) for of in (layer, by_hand))
+    for ours, theirs in zip(got, want, strict=True):
+        np.testing.assert_allclose(ours, theirs, rtol=1e-4, atol=1e-5)
+
+
 def test_evaluation_uses_the_running_moments_and_keeps_them():
     x = jnp.float32([[1.0], [5.0]])
     y, updated = apply(VARIABLES, x, norm.Mode())

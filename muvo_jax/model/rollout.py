@@ -154,8 +154,8 @@ def imagine(model: WorldModel, variables: Variables, key: jax.Array, state: Late
             sampled: bool = True, temperature: float | jax.Array = 1.0, same_noise: bool = False) -> Dream:
     """Dreams on from latent states without observations. Compiled once per model, shapes and policy function.
 
-    `jit`, `vmap`, `grad` and `jvp` work from outside. Shapes and keys are always checked, the values of actions where
-    they are concrete (not traced), all before anything is compiled. Nothing is decoded; see `decode`.
+    `jit`, `vmap`, `shard_map`, `grad` and `jvp` work from outside. Shapes and keys are always checked, the values of
+    actions where they are concrete (not traced), all before anything is compiled. Nothing is decoded; see `decode`.
 
     Args:
       model, variables: the model.

@@ -48,3 +48,9 @@ def test_what_was_hidden_before_does_not_move():
     older = seen((14, 16))
     older[16:20, 16:18] = 0.0
     assert not flow(seen((16, 16)), [older] * 3).any()
+
+
+def test_the_flow_is_float32_where_jax_counts_in_float64():
+    with jax.enable_x64(True):
+        hits, older = jnp.zeros((1, 8, 8, 2), jnp.float32), jnp.zeros((1, scene_flow.LAGS, 8, 8, 2), jnp.float32)
+        assert jax.eval_shape(scene_flow.cell_flow, hits, older).dtype == jnp.float32

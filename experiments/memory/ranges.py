@@ -3,8 +3,8 @@
     python -m experiments.memory.ranges RUN [WINDOWS]
 
 "the model's returns at the memory's ranges" asks the model only which pixels return; "but those that doubt the memory"
-leaves out its returns that are more than DOUBT_M from the memory's. The truth beside itself says what the measure costs,
-which draws other points of each.
+leaves out its returns that are more than DOUBT_M from the memory's. The truth beside itself says what the measure
+costs, which draws other points of each.
 """
 
 import sys

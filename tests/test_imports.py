@@ -38,8 +38,8 @@ ALLOWED = {
                         "safetensors_file"},
 }
 # Inside data: what every format shares, the formats, what finds them, and what makes batches of any of them.
-RECORDED = {"errors", "fields", "words", "schema", "sequences", "files", "description", "runs", "ego_motion",
-            "processes", "fingerprints"}
+RECORDED = {"errors", "fields", "words", "schema", "sequences", "files", "pictures", "description", "runs",
+            "ego_motion", "processes", "fingerprints"}
 ALLOWED_IN_DATA = dict.fromkeys(RECORDED, RECORDED) | {
     "plain": RECORDED,
     "kitti": RECORDED,

@@ -27,7 +27,7 @@ from typing import NamedTuple
 import numpy as np
 
 from muvo_jax import config as config_lib
-from muvo_jax.data import description, fields, files, processes, schema
+from muvo_jax.data import description, fields, files, pictures, processes, schema
 from muvo_jax.data.muvo import files as muvo_files
 from muvo_jax.data.muvo import frame_pickle, safe_pickle
 from muvo_jax.data.muvo import reader as muvo_reader
@@ -323,7 +323,7 @@ def _content(rig: Rig, frame: Frame) -> bytes:
 def _read_plain(frame: Frame) -> tuple[np.ndarray, np.ndarray]:
     """Depth [H, W] and points [N, 3], m, float32, of which the reader of the plain format would say the same."""
     recorded = (files.read_npz(frame.depth, "depth_m") if frame.depth.suffix.lower() == ".npz" else
-                files.read_image(frame.depth, "depth_m"))
+                pictures.read(frame.depth, "depth_m"))
     points_m = fields.conform("points_m", files.read_npz(frame.points, "points_m"), str(frame.points))
     return fields.conform("depth_m", recorded, str(frame.depth)), files.finite_points(points_m, frame.points)
 

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from muvo_jax import command_line, record_carla
-from muvo_jax.data import processes, voxelizing
+from muvo_jax.data import pictures, processes, voxelizing
 from muvo_jax.data.carla import client as carla_client
 from muvo_jax.data.carla import drives as carla_drives
 from muvo_jax.data.carla import frames as carla_frames
@@ -150,7 +150,7 @@ def test_depth_and_tags_come_from_the_clients_channels():
         **seen.measurements, "depth": camera(100, depth), "classes": camera(100, tags)})).start(JOB)
     frame = carla_frames.decode(seen, SETTINGS)
     np.testing.assert_allclose(frame["depth_m"][0, :3], np.array([1, 2 ** 24 - 1, 2 ** 20]) * 1000 / (2 ** 24 - 1))
-    assert plain_writer.encode_depth(frame["depth_m"])[0, 1] == plain_writer.DEPTH_SKY
+    assert plain_writer.encode_depth(frame["depth_m"])[0, 1] == pictures.DEPTH_SKY
     assert frame["classes"][0, :2].tolist() == [muvo_files.SKY, 7]
 
 

@@ -12,7 +12,7 @@ from hypothesis.extra import numpy as arrays
 
 from muvo_jax import config as config_lib
 from muvo_jax import types
-from muvo_jax.data import fields, files, schema
+from muvo_jax.data import fields, files, pictures, schema
 from muvo_jax.data.kitti import reader as kitti_reader
 from muvo_jax.data.packed import reader as packed_reader
 from muvo_jax.data.packed import records
@@ -75,7 +75,7 @@ def frames(draw):
         frame[field.name] = values if shape else field.dtype(values[()])
     frame |= draw(cameras())
     if draw(st.booleans()):
-        frame["depth_m"] = plain_reader.decode_depth(plain_writer.encode_depth(frame["depth_m"]))
+        frame["depth_m"] = pictures.decode_depth(plain_writer.encode_depth(frame["depth_m"]))
         frame["depth_m"][0, 0] = np.inf
     return frame
 

@@ -9,7 +9,7 @@ from PIL import Image
 
 from muvo_jax import config as config_lib
 from muvo_jax import presets
-from muvo_jax.data import fields, files, fitting, pipeline, prepare, schema, sources, windows
+from muvo_jax.data import fields, fitting, pictures, pipeline, prepare, schema, sources, windows
 from muvo_jax.data.kitti import reader as kitti_reader
 from muvo_jax.data.packed import writer as packed_writer
 from muvo_jax.data.plain import reader as plain_reader
@@ -155,14 +155,14 @@ def test_pictures_that_say_the_same_otherwise_are_read(tmp_path):
     for name, image in {"grey": Image.fromarray(grey), "colours": Image.fromarray(np.stack([grey] * 3, axis=-1)),
                         "alpha": Image.fromarray(grey).convert("LA")}.items():
         image.save(tmp_path / f"{name}.png")
-        np.testing.assert_array_equal(files.read_image(tmp_path / f"{name}.png", "L"), grey)
+        np.testing.assert_array_equal(pictures.read(tmp_path / f"{name}.png", "L"), grey)
     palette = Image.fromarray(grey % 5)
     palette.putpalette([200, 10, 10, 10, 200, 10, 10, 10, 200, 0, 0, 0, 255, 255, 255])
     palette.save(tmp_path / "palette.png")
-    np.testing.assert_array_equal(files.read_image(tmp_path / "palette.png", "classes"), grey % 5)
+    np.testing.assert_array_equal(pictures.read(tmp_path / "palette.png", "classes"), grey % 5)
     rgba = Image.fromarray(np.dstack([grey, grey, grey, np.full_like(grey, 7)]))
     rgba.save(tmp_path / "rgba.png")
-    np.testing.assert_array_equal(files.read_image(tmp_path / "rgba.png", "RGB"), np.stack([grey] * 3, axis=-1))
+    np.testing.assert_array_equal(pictures.read(tmp_path / "rgba.png", "RGB"), np.stack([grey] * 3, axis=-1))
 
 
 @pytest.mark.parametrize("orientation", range(1, 9))
@@ -176,7 +176,7 @@ def test_pictures_are_turned_as_the_camera_was_held(tmp_path, orientation):
     exif = Image.Exif()
     exif[0x0112] = orientation
     Image.fromarray(np.ascontiguousarray(stored)).save(tmp_path / "a.jpg", exif=exif, quality=100)
-    np.testing.assert_allclose(files.read_image(tmp_path / "a.jpg", "RGB"), upright, atol=12)
+    np.testing.assert_allclose(pictures.read(tmp_path / "a.jpg", "RGB"), upright, atol=12)
 
 
 @pytest.mark.parametrize(("file", "name", "values", "message"), [

@@ -28,7 +28,7 @@ from collections.abc import Collection
 import numpy as np
 
 from muvo_jax import config as config_lib
-from muvo_jax.data import ego_motion, files, schema, sequences
+from muvo_jax.data import ego_motion, files, pictures, schema, sequences
 from muvo_jax.data.kitti import files as kitti_files
 from muvo_jax.data.kitti.files import LIDAR_HEIGHT_M, read_camera, read_oxts, read_pose, read_scan
 from muvo_jax.limits import between
@@ -155,7 +155,7 @@ class KittiRecording:
             "frame_id": np.int64(frame_id),
         }
         if drive.camera is not None and "image" in names:
-            image = files.read_image(paths[self._camera], "RGB")
+            image = pictures.read(paths[self._camera], "RGB")
             if image.shape[:2] != (drive.camera.height_px, drive.camera.width_px):
                 raise schema.DataError(f"{paths[self._camera]}: {image.shape[1]}x{image.shape[0]} pixels, but the "
                                        f"calibration (S_rect) is for {drive.camera.width_px}x{drive.camera.height_px}. "

@@ -21,7 +21,7 @@ import numpy as np
 import scipy.ndimage
 
 from muvo_jax import config as config_lib
-from muvo_jax.data import files, schema
+from muvo_jax.data import files, pictures, schema
 from muvo_jax.data.muvo import safe_pickle
 
 KINDS = {"image": ".png", "depth_semantic": ".png", "birdview": ".png", "routemap": ".png", "points_semantic": ".npy",
@@ -161,7 +161,7 @@ def point_tags(scan: Points, path: pathlib.Path) -> np.ndarray:
 
 def read_route_map(path: pathlib.Path) -> np.ndarray:
     """Returns the route from above as it is stored, uint8 [rows, columns], 255 on the route; raises DataError."""
-    return files.read_image(path, "L")
+    return pictures.read(path, "L")
 
 
 def read_points(path: pathlib.Path, lidar_position_m: tuple[float, float, float]) -> Points:
@@ -233,7 +233,7 @@ def read_voxels(path: pathlib.Path, grid: config_lib.VoxelGrid,
 
 def _read(path: pathlib.Path, shape: tuple[int | None, ...]) -> np.ndarray:
     """An image as it is stored, of whole numbers and of this shape (None: any)."""
-    pixels = files.read_image(path, None)
+    pixels = pictures.read(path, None)
     fits = len(shape) == pixels.ndim and all(map(lambda want, side: want in (None, side), shape, pixels.shape))
     if not fits or pixels.dtype.kind not in "ui":
         raise schema.DataError(f"{path}: an image {list(pixels.shape)} of {pixels.dtype}, expected "

@@ -27,7 +27,7 @@ from collections.abc import Collection
 import numpy as np
 
 from muvo_jax import config as config_lib
-from muvo_jax.data import description, ego_motion, fields, files, runs, schema, sequences
+from muvo_jax.data import description, ego_motion, fields, files, pictures, runs, schema, sequences
 from muvo_jax.data.muvo import files as muvo_files
 from muvo_jax.data.muvo import runs as muvo_runs
 from muvo_jax.data.muvo import tags as muvo_tags
@@ -132,7 +132,7 @@ class MuvoRecording:
         paths = {key: self._files[run.name][kind].path(row) for key, kind in self._kinds.items() if key in wanted}
         if described.camera is not None and "image" in paths:
             camera = described.camera
-            frame["image"] = files.read_image(paths["image"], "RGB")
+            frame["image"] = pictures.read(paths["image"], "RGB")
             if frame["image"].shape[:2] != (camera.height_px, camera.width_px):
                 raise schema.DataError(f"{paths['image']}: {frame['image'].shape[1]}x{frame['image'].shape[0]} pixels, "
                                        f"the recording's first image has {camera.width_px}x{camera.height_px}. Do not "
@@ -189,7 +189,7 @@ class MuvoRecording:
         faults = []
         for name, row in itertools.chain(inside, every):
             try:
-                height_px, width_px = files.read_image(self._files[name]["image"].path(row), "RGB").shape[:2]
+                height_px, width_px = pictures.read(self._files[name]["image"].path(row), "RGB").shape[:2]
             except schema.DataError as error:
                 faults.append(error)
             else:

@@ -25,7 +25,7 @@ from collections.abc import Collection
 import numpy as np
 
 from muvo_jax import config as config_lib
-from muvo_jax.data import ego_motion, files, runs, schema, sequences, words
+from muvo_jax.data import ego_motion, files, pictures, runs, schema, sequences, words
 from muvo_jax.data.nuscenes import scans, scene_splits, scenes, tables
 
 CAMERAS = ("CAM_FRONT", "CAM_FRONT_LEFT", "CAM_FRONT_RIGHT", "CAM_BACK", "CAM_BACK_LEFT", "CAM_BACK_RIGHT")
@@ -103,7 +103,7 @@ class NuScenesRecording:
         }
         if "image" in names and self._has(sequence, "image"):
             path = self._path(scene, "image", row)
-            frame["image"] = files.read_image(path, "RGB")
+            frame["image"] = pictures.read(path, "RGB")
             if frame["image"].shape[:2] != (scene.camera.height_px, scene.camera.width_px):
                 raise schema.DataError(f"{path}: {frame['image'].shape[1]}x{frame['image'].shape[0]} pixels, but "
                                        f"sample_data.json says {scene.camera.width_px}x{scene.camera.height_px}. Use "

@@ -18,12 +18,12 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from muvo_jax.data import files, schema
+from muvo_jax.data import files, pictures, schema
 from muvo_jax.data.packed import manifest
 
 _LENGTH = struct.Struct("<I")
 _ENCODINGS = ("raw", "zlib", "png", "jpeg", "float16")
-_RECORDED = {f"recorded {mode}": mode for mode in files.PICTURE_MODES}  # the bytes of a file, and how they are read
+_RECORDED = {f"recorded {mode}": mode for mode in pictures.MODES}  # the bytes of a file, and how they are read
 # What headers, arrays and pictures that are anything at all can lead to.
 _MALFORMED = (ValueError, KeyError, TypeError, AttributeError, OSError, OverflowError, RecursionError, MemoryError,
               SyntaxError, struct.error, zlib.error, Image.DecompressionBombError)
@@ -51,7 +51,7 @@ def place_of(run: str, row: int) -> str:
     return f"row {row} of run {run}"
 
 
-def encode_frame(frame: schema.RawFrame, encoding: Encoding, recorded: Sequence[files.Picture] = (),
+def encode_frame(frame: schema.RawFrame, encoding: Encoding, recorded: Sequence[pictures.Picture] = (),
                  place: str = "") -> bytes:
     """One frame as one record.
 
@@ -115,7 +115,7 @@ def damaged(where: str, why: str) -> schema.DataError:
                             f"with data.skip_corrupt_shards (records.PackedRecording(corrupt=\"skip\")).")
 
 
-def _encode(name: str, array: np.ndarray, encoding: Encoding, recorded: files.Picture | None) -> tuple[str, bytes]:
+def _encode(name: str, array: np.ndarray, encoding: Encoding, recorded: pictures.Picture | None) -> tuple[str, bytes]:
     as_jpeg = name == "image" and encoding.jpeg_quality is not None
     if recorded is not None and not as_jpeg:
         return f"recorded {recorded.mode}", recorded.content
@@ -142,7 +142,7 @@ def _decode(content: bytes, encoding: str, dtype: np.dtype, shape: tuple[int, ..
     if not all(manifest.is_count(side) for side in shape) or size * dtype.itemsize > files.LARGEST_ARRAY_BYTES:
         raise ValueError(f"{dtype}{list(shape)} is larger than {files.LARGEST_ARRAY_BYTES} bytes")
     if encoding in ("png", "jpeg") or encoding in _RECORDED:
-        array = files.decode_image(content, _RECORDED.get(encoding), "its picture", shape)
+        array = pictures.decode(content, _RECORDED.get(encoding), "its picture", shape)
     elif encoding == "float16":
         array = np.frombuffer(_inflated(content, 2 * size), np.float16).astype(dtype).reshape(shape)
     elif encoding == "zlib":

@@ -15,7 +15,7 @@ from typing import NamedTuple
 
 from array_record.python import array_record_module
 
-from muvo_jax.data import files, fingerprints, processes, schema, sources
+from muvo_jax.data import files, fingerprints, pictures, processes, schema, sources
 from muvo_jax.data.packed import manifest, records
 
 PLAN_FILE = "plan.json"
@@ -105,10 +105,10 @@ def write_shard(recording: schema.Recording, out: pathlib.Path, encoding: record
     try:
         for sequence, start, stop in shard.parts:
             for index in range(start, stop):
-                with files.keeping_pictures() as pictures:
+                with pictures.keeping() as kept:
                     frame = recording.read(sequence, index)
                 place = records.place_of(sequence.name, sequence.start + index)
-                record = records.encode_frame(frame, encoding, pictures, place)
+                record = records.encode_frame(frame, encoding, kept, place)
                 with _writing(path):
                     writer.write(record)
                 yield shard.number

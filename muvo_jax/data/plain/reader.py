@@ -34,13 +34,12 @@ from typing import Any
 import numpy as np
 
 from muvo_jax import config as config_lib
-from muvo_jax.data import description, fields, files, runs, schema, sequences
+from muvo_jax.data import description, fields, files, pictures, runs, schema, sequences
 from muvo_jax.data.plain import cameras, frames_table
 
 SCHEMA_VERSION = 1
 DESCRIPTION_FILE = "recording.toml"
 FRAMES_FILE = frames_table.FRAMES_FILE
-DEPTH_UNIT_M, DEPTH_SKY, decode_depth = files.DEPTH_UNIT_M, files.DEPTH_SKY, files.decode_depth
 _DIGITS = 6
 _NEEDED = frozenset(("speed_mps", "action", "timestamp_s", "frame_id"))
 _TOP_LEVEL = ("schema_version", "name", "rate_hz", "splits", "classes")
@@ -188,7 +187,7 @@ class PlainRecording:
         if path.suffix.lower() == ".npz":
             values = files.read_npz(path, field.array)
         else:
-            values = files.read_image(path, _MODES[name])
+            values = pictures.read(path, _MODES[name])
         values = fields.conform(name, values, str(path), self.description.shape_of(name))
         if name in ("image_classes", "point_classes"):
             fields.check_classes(name, values, self._class_names, str(path))

@@ -18,13 +18,12 @@ import numpy as np
 from PIL import Image
 
 from muvo_jax import config as config_lib
-from muvo_jax.data import description, fields, files, schema
+from muvo_jax.data import description, fields, files, pictures, schema
 from muvo_jax.data.plain import cameras, frames_table
 from muvo_jax.data.plain import reader as plain_reader
 
 COLUMNS = ("frame_id", "timestamp_s", "x_m", "y_m", "yaw_rad", "speed_mps", "acceleration", "steering", "reward",
            "is_terminal", "weather")
-DEPTH_UNIT_M, DEPTH_SKY = plain_reader.DEPTH_UNIT_M, plain_reader.DEPTH_SKY
 _NO_FILE = fields.Field("", np.uint8)
 # Names of RawFrame and what recorders call them: both are taken.
 _ALIASES = {"classes": "image_classes", "point_tags": "point_classes"}
@@ -173,7 +172,7 @@ class RunWriter:
     def _write_depth(self, frame_id: int, depth_m: np.ndarray, *, exactly: bool) -> None:
         """As centimetres; where these would not give the same numbers again, and that is asked for, as they are."""
         centimetres = encode_depth(depth_m)
-        if exactly and not np.array_equal(plain_reader.decode_depth(centimetres), depth_m):
+        if exactly and not np.array_equal(pictures.decode_depth(centimetres), depth_m):
             self._path("depth", frame_id, ".npz").write_bytes(files.npz_bytes({"depth_m": depth_m}))
         else:
             self._save_png("depth", frame_id, centimetres)
@@ -208,8 +207,8 @@ def _cells_of(field: fields.Field, value: np.ndarray) -> dict[str, str]:
 
 def encode_depth(depth_m: np.ndarray) -> np.ndarray:
     """Metres along the optical axis to uint16 centimetres; what is infinite or beyond 655.34 m is sky."""
-    centimetres = np.rint(np.where(np.isfinite(depth_m), depth_m, np.inf) / DEPTH_UNIT_M)
-    return np.minimum(centimetres, DEPTH_SKY).astype(np.uint16)
+    centimetres = np.rint(np.where(np.isfinite(depth_m), depth_m, np.inf) / pictures.DEPTH_UNIT_M)
+    return np.minimum(centimetres, pictures.DEPTH_SKY).astype(np.uint16)
 
 
 def _cell(value) -> str:

@@ -21,7 +21,7 @@ import numpy as np
 import scipy.ndimage
 
 from muvo_jax import config as config_lib
-from muvo_jax.data import files, schema
+from muvo_jax.data import pictures, schema
 from muvo_jax.data.muvo import files as muvo_files
 from muvo_jax.data.muvo import reader as muvo_reader
 from muvo_jax.data.muvo import runs as muvo_runs
@@ -159,7 +159,7 @@ def _read_frame(run: muvo_runs.Run, row: int, config: Mapping, shapes: Mapping) 
     *_, most_points, _ = shapes.get("points_raw", (_MOST_POINTS, 3))
     lidar = dataclasses.replace(muvo_reader.LIDAR, rows=rows, columns=columns)
     action = muvo_runs.actions(run)[row]
-    image = files.read_image(run.path("image", row), "RGB")
+    image = pictures.read(run.path("image", row), "RGB")
     depth, tags = muvo_files.read_depth_semantic(run.path("depth_semantic", row))
     birdview = muvo_files.read_birdview(run.path("birdview", row))
     scan = muvo_files.read_points(run.path("points_semantic", row), lidar.position_m)
@@ -179,7 +179,7 @@ def _read_frame(run: muvo_runs.Run, row: int, config: Mapping, shapes: Mapping) 
         "points_raw": raw, "num_points": np.int64(len(scan.points_m)),
         "image_instance_mask": np.isin(tags, (muvo_files.PEDESTRIAN, muvo_files.VEHICLE))[None],
         "semantic_image": classes[None], "depth": np.where(depth > 0.999, -1.0, depth)[None],
-        "depth_color": files.read_image(run.path("depth_semantic", row), "RGBA")[..., :3].transpose(2, 0, 1) / 255.0,
+        "depth_color": pictures.read(run.path("depth_semantic", row), "RGBA")[..., :3].transpose(2, 0, 1) / 255.0,
         "throttle_brake": action[:1], "steering": action[1:], "speed": run.numbers("speed", 1)[row],
         "reward": np.clip(run.numbers("reward", 1)[row], -1.0, 1.0), "value_function": run.numbers("value", 1)[row],
         "intrinsics": camera_ops.intrinsics_from_fov(width_px, height_px, math.radians(config["IMAGE_FOV"])),

@@ -7,8 +7,7 @@ import pytest
 from PIL import Image
 
 from muvo_jax import config as config_lib
-from muvo_jax.data import files, schema, sources
-from muvo_jax.data.plain import reader as plain_reader
+from muvo_jax.data import files, pictures, schema, sources
 from muvo_jax.data.plain import writer as plain_writer
 from muvo_jax.ops import camera as camera_ops
 
@@ -68,7 +67,7 @@ def test_what_is_read_back_equals_what_was_written(tmp_path):
 def test_depth_and_classes_are_kept_beside_the_image(tmp_path):
     (frame,) = record(tmp_path, count=1)
     with Image.open(tmp_path / "train/000/depth/000000.png") as image:
-        depth_m = plain_reader.decode_depth(np.asarray(image))
+        depth_m = pictures.decode_depth(np.asarray(image))
     assert np.isinf(depth_m[0]).all()
     np.testing.assert_allclose(depth_m[1:], frame["depth_m"][1:], atol=0.00501)
     with Image.open(tmp_path / "train/000/classes/000000.png") as image:

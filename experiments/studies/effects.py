@@ -44,12 +44,18 @@ def verdict(low: float, high: float, says: str, margin: float) -> str:
 
 
 def pairs_needed(differences: np.ndarray, says: str, margin: float) -> int | None:
-    """How many pairs would tell, if the effect and its scatter are as they seem; None where that cannot be said."""
-    if len(differences) < 2 or not differences.std(ddof=1):
+    """Of how many pairs Student's interval would tell, if the effect and its scatter are as they seem; None where that
+    cannot be said."""
+    if len(differences) < 2 or not (scatter := differences.std(ddof=1)):
         return None
     mean = differences.mean()
     distance = {"better": abs(mean), "par": abs(mean + margin), "same": abs(margin - abs(mean))}[says]
-    return None if not distance else max(2, math.ceil((2.0 * differences.std(ddof=1) / distance) ** 2))
+    if not distance:
+        return None
+    count = max(2, math.ceil((stats.norm.ppf(0.975) * scatter / distance) ** 2))  # of many, where t is normal
+    while stats.t.ppf(0.975, count - 1) * scatter / math.sqrt(count) > distance:
+        count += 1
+    return count
 
 
 def lead(run: Mapping[str, Any], split: str, metric: str) -> float:

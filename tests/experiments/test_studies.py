@@ -10,6 +10,7 @@ import sys
 import numpy as np
 import pytest
 import tyro
+from scipy import stats
 
 import muvo_jax
 from experiments import run as study_command
@@ -154,6 +155,17 @@ def test_claims_compare_runs_of_one_seed_and_turn_chamfer_round():
     order = rows["another domain keeps the order of the arms (Spearman correlation)", tables.PSNR, "val_rl to val_ds"]
     assert order["effect"] == pytest.approx(1.0)
     assert effects.best_and_worst(tables.FUSION, runs) == ("RV-BEV-AVG", "PP-WOB-TR")
+
+
+@pytest.mark.parametrize("scatter", [0.05, 0.3, 2.0])
+def test_as_many_pairs_as_are_said_would_tell_and_one_less_would_not(scatter):
+    differences = np.array([0.2 - scatter, 0.2 + scatter])
+    count, deviation = effects.pairs_needed(differences, "better", 0.0), differences.std(ddof=1)
+
+    def low(pairs):  # of the interval over so many pairs that scatter alike
+        return 0.2 - stats.t.ppf(0.975, pairs - 1) * deviation / np.sqrt(pairs)
+
+    assert low(count) >= 0.0 and count > 2 and low(count - 1) < 0.0
 
 
 def test_a_claim_of_arms_that_learned_nothing_is_too_short_to_tell_and_how_long_is_said():

@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import tyro
 
-from muvo_jax import late
+from muvo_jax import cache, late
 
 with late.imports():
     from muvo_jax import recordings
@@ -185,13 +185,9 @@ def prepare_compiler() -> None:
     For a JAX that is yet to be imported: it reads the variables once.
     """
     host.use_plain_emitters()
-    os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(cache_folder() / "jax"))
-
-
-def cache_folder() -> pathlib.Path:
-    """$XDG_CACHE_HOME/muvo_jax, or ~/.cache/muvo_jax."""
-    base = os.environ.get("XDG_CACHE_HOME") or pathlib.Path.home() / ".cache"
-    return pathlib.Path(base) / "muvo_jax"
+    if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
+        with contextlib.suppress(OSError):  # nowhere to keep them: they are compiled each time
+            os.environ["JAX_COMPILATION_CACHE_DIR"] = str(cache.folder() / "jax")
 
 
 def process_start_s() -> float:

@@ -15,7 +15,7 @@ import pytest
 
 import muvo_jax
 from muvo_jax import __main__ as listing
-from muvo_jax import command_line, drive, evaluate, evaluation_report, presets, record_carla, train
+from muvo_jax import cache, command_line, drive, evaluate, evaluation_report, presets, record_carla, train
 from muvo_jax import config as config_lib
 from muvo_jax.data import words
 from muvo_jax.training import host, run_folder, screen
@@ -131,6 +131,21 @@ def test_a_count_below_zero_is_a_wrong_command_line(command, option, capsys, mon
         _module(command).main()
     flag, _, value = option.partition("=")
     assert ended.value.code == 2 and f"{flag} is {float(value):g}" in capsys.readouterr().err.replace(".0", "")
+
+
+def test_without_a_home_commands_work_and_what_must_be_kept_says_where(monkeypatch):
+    def nowhere():
+        raise RuntimeError("Could not determine home directory.")
+
+    monkeypatch.undo()  # of this module's fixture
+    for name in ("XDG_CACHE_HOME", "JAX_COMPILATION_CACHE_DIR"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setattr(pathlib.Path, "home", staticmethod(nowhere))
+    monkeypatch.setattr(host, "use_plain_emitters", lambda: None)
+    command_line.prepare_compiler()
+    assert "JAX_COMPILATION_CACHE_DIR" not in os.environ
+    with pytest.raises(OSError, match="Set XDG_CACHE_HOME to a folder"):
+        cache.folder()
 
 
 def test_a_path_may_begin_at_home(monkeypatch, tmp_path):

@@ -13,6 +13,7 @@ PACKAGE = pathlib.Path(muvo_jax.__file__).parent
 BASE = {"types", "config", "geometry", "limits", "ops", "head"}
 ALLOWED = {
     "types": set(),
+    "cache": set(),
     "limits": set(),
     "safetensors_file": set(),
     "geometry": {"limits"},
@@ -29,7 +30,7 @@ ALLOWED = {
     "run": {"types", "config", "model"},
     "agents": BASE | {"nn", "model", "metrics", "run", "safetensors_file"},
     "data": BASE,
-    "town": BASE | {"data"},
+    "town": BASE | {"data", "cache"},
     "recordings": {"config", "data", "town"},
     "viz": BASE,
     "interop": BASE | {"nn", "model", "objectives", "metrics", "data", "training", "command_line", "late",

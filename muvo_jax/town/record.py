@@ -20,6 +20,7 @@ from typing import IO, NamedTuple, cast
 
 import numpy as np
 
+from muvo_jax import cache
 from muvo_jax import config as config_lib
 from muvo_jax.data import processes, schema
 from muvo_jax.data.plain import writer as plain_writer
@@ -73,7 +74,7 @@ def cached_town(config: config_lib.Config, progress: Progress | None = None, *,
                 split: str | None = None) -> pathlib.Path:
     """Returns the folder of the recording that `config` asks for, recording what is missing of it first.
 
-    It lies in $XDG_CACHE_HOME (or ~/.cache) under muvo_jax/town-<hash of everything that decides its content>.
+    It lies in the cache folder (cache.py), under town-<hash of everything that decides its content>.
 
     Args:
       config: data.town_size, data.town_seed, the model's sensors and the action contract are used.
@@ -82,11 +83,11 @@ def cached_town(config: config_lib.Config, progress: Progress | None = None, *,
 
     Raises:
       ValueError: for a size or split that does not exist.
+      OSError: where there is no cache folder, or it cannot be written.
     """
     check_size(config.data.town_size)
     town_config = settings.from_config(config)
-    cache = pathlib.Path(os.environ.get("XDG_CACHE_HOME") or pathlib.Path.home() / ".cache")
-    directory = cache / "muvo_jax" / f"town-{fingerprint(town_config, config.data.town_size)}"
+    directory = cache.folder() / f"town-{fingerprint(town_config, config.data.town_size)}"
     known = settings.SIZES[config.data.town_size]
     if split is not None and split not in known:
         raise ValueError(f"the town has no split {split!r}; it has {', '.join(known)}.")
@@ -127,7 +128,7 @@ def record_town(directory: pathlib.Path | str, town_config: settings.TownConfig,
         total = sum(job.frames for job in jobs(size) if split in (None, job.split))
         done = total - sum(job.frames for job in missing)
         if workers is None:
-            workers = min(os.cpu_count() or 1, (total - done) // WORKER_FRAMES)
+            workers = min(processes.processors(), (total - done) // WORKER_FRAMES)
         frames = (_record_here(directory, town_config, missing) if workers < 1
                   else _record_in_workers(directory, town_config, missing, workers))
         for count in frames:

@@ -9,6 +9,7 @@ import colorsys
 import functools
 import os
 import pathlib
+import unicodedata
 from collections.abc import Sequence
 
 import numpy as np
@@ -52,15 +53,21 @@ def font(size_px: int):
     return ImageFont.load_default(size_px)
 
 
+def plain(text: str) -> str:
+    """Text in letters that the font has: without accents, "?" for other scripts (names may have any)."""
+    bare = "".join(letter for letter in unicodedata.normalize("NFKD", text) if not unicodedata.combining(letter))
+    return bare.encode("ascii", "replace").decode()
+
+
 def text_width_px(text: str, size_px: int = 13) -> int:
-    return int(font(size_px).getlength(text)) + 1
+    return int(font(size_px).getlength(plain(text))) + 1
 
 
 def write(picture: np.ndarray, text: str, row: int, column: int, *, size_px: int = 13, colour: Colour = INK,
           anchor: str = "la") -> np.ndarray:
     """Returns the picture with text at (row, column); `anchor` as pillow names it: "la" left top, "mm" centred."""
     image = Image.fromarray(picture)
-    ImageDraw.Draw(image).text((column, row), text, fill=colour, font=font(size_px), anchor=anchor)
+    ImageDraw.Draw(image).text((column, row), plain(text), fill=colour, font=font(size_px), anchor=anchor)
     return np.array(image)
 
 

@@ -38,7 +38,9 @@ def above(points_m: np.ndarray, occupancy: np.ndarray | None, grid: config_lib.V
           side_px: int = 384) -> np.ndarray:
     """Points from above, beside the voxels (where there are any) with the same points as white dots over them."""
     extent_m = 48.0 if grid is None else max(abs(grid.origin_m[0]), abs(grid.origin_m[1]))
-    parts = [canvas.caption(panels.birds_eye(points_m, extent_m=extent_m, side_px=side_px), "points from above")]
+    heights = {} if grid is None else {"height_span_m": panels.height_span(grid)}  # of the voxels beside them
+    seen = panels.birds_eye(points_m, extent_m=extent_m, side_px=side_px, **heights)
+    parts = [canvas.caption(seen, "points from above")]
     if occupancy is not None and grid is not None:
         voxels = panels.occupancy_from_above(occupancy, grid, columns_px=side_px)
         scale = side_px / (grid.shape[1] * grid.voxel_size_m)

@@ -54,6 +54,14 @@ def test_a_border_and_a_caption_leave_the_picture_as_it_is():
         assert (below[:-20] == canvas.INK).all(axis=-1).any()
 
 
+def test_names_of_any_script_are_drawn_in_letters_that_the_font_has():
+    blank = canvas.blank(20, 200)
+    drawn = [canvas.write(blank, text, 2, 2) for text in ("Zürich, été", "Zurich, ete", "東京", "??")]
+    np.testing.assert_array_equal(drawn[0], drawn[1])
+    np.testing.assert_array_equal(drawn[2], drawn[3])
+    assert canvas.text_width_px("Zürich") == canvas.text_width_px("Zurich")
+
+
 def test_classes_look_unlike_and_what_is_unlabelled_is_black():
     table = canvas.class_colours(20).astype(int)
     assert table.shape == (256, 3) and not table[20:].any()

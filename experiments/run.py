@@ -16,7 +16,7 @@ import tyro
 from experiments.studies import cost, effects, queue, report, tables
 from muvo_jax import command_line
 from muvo_jax import config as config_lib
-from muvo_jax.data import processes
+from muvo_jax.data import processes, sources
 from muvo_jax.training import screen
 
 
@@ -105,6 +105,30 @@ def _check_one_card(complete: list[dict[str, Any]], folder: pathlib.Path) -> Non
                              f"them by one (python -m muvo_jax.evaluate RUN), or begin anew with another --runs-dir.")
 
 
+def _known(paths: list[pathlib.Path], options: Options, study: tables.Study) -> dict[str, Any] | None:
+    """What results of earlier sittings say, the runs of all of them together; None where there are none."""
+    merged: dict[str, Any] | None = None
+    for path in paths:
+        found = json.loads(path.read_text(encoding="utf-8"))
+        _check_same(found, options, study, path)
+        merged = merged or found
+        for label, seeds in found["runs"].items():
+            held = merged["runs"].setdefault(label, {})
+            for seed, scores in seeds.items():
+                if not held.get(seed) or "died" in held[seed]:
+                    held[seed] = scores
+    return merged
+
+
+def _check_splits(data: str) -> None:
+    """Raises ValueError where a recording lacks a split that studies judge: before anything is trained."""
+    held = sources.open_recording(data).description.splits
+    if lacking := ", ".join(split for split in tables.SPLITS if split not in held):
+        raise ValueError(f"recording {data} has the splits {', '.join(held)}, but a study judges "
+                         f"{', '.join(tables.SPLITS)}: it lacks {lacking}. python -m muvo_jax.record_carla records "
+                         f"drives that have them; of others rename what was held out.")
+
+
 def _check_same(existing: dict[str, Any], options: Options, study: tables.Study, path: pathlib.Path) -> None:
     """Refuses to add runs of other code, another study or other data to results.
 
@@ -128,10 +152,12 @@ def run(options: Options, show: screen.Screen) -> None:
     shard, seeds = _shard(options.shard), options.seeds or tables.SEEDS[scale]
     folder = options.runs_dir / f"{study.name}-{scale}"
     planned, extra = queue.jobs(study, scale, seeds), ([f"--data={options.data}"] if options.data else [])
+    if options.data:
+        _check_splits(options.data)
     if scale == "paper":
         if options.data is None:
-            raise ValueError("the paper's scale trains on recordings of CARLA in the authors' layout: give --data=PATH "
-                             "(docs/data.md says how to record them).")
+            raise ValueError("the paper's scale trains on recordings of CARLA: give --data=PATH (python -m "
+                             "muvo_jax.record_carla makes them, with the splits that a study judges).")
         for line in cost.told(study, planned, folder, extra):
             show.line(line)
         if not options.yes:
@@ -139,9 +165,7 @@ def run(options: Options, show: screen.Screen) -> None:
             return
     folder.mkdir(parents=True, exist_ok=True)
     known = [place / report.RESULTS for place in (folder, options.out) if place and (place / report.RESULTS).is_file()]
-    existing = json.loads(known[0].read_text(encoding="utf-8")) if known else None
-    if existing:
-        _check_same(existing, options, study, known[0])
+    existing = _known(known, options, study)
 
     def save(jobs: list[queue.Job]) -> dict[str, Any]:
         with processes.locked(folder / ".lock", "reporting", wait=True):

@@ -18,7 +18,8 @@ from experiments.studies import tables
 PACKAGE = pathlib.Path(muvo_jax.__file__).parent
 # What decides the numbers of a run; other code may change between two sittings.
 _NUMERIC = ("config", "data", "heads", "metrics", "model", "nn", "objectives", "ops", "town", "training", "types",
-            "evaluate.py", "geometry.py", "head.py", "presets.py", "recordings.py")
+            "choices.py", "evaluate.py", "geometry.py", "head.py", "limits.py", "presets.py", "recordings.py",
+            "train.py")
 EVALUATION, LOG, DIED, COST = "evaluation.json", "log.txt", "died.txt", "cost.json"
 ATTEMPTS = 2
 
@@ -58,8 +59,10 @@ def of_shard(planned: Sequence[Job], shard: int, shards: int) -> list[Job]:
 
 
 def code_fingerprint() -> str:
-    """Names the code that decides the numbers of a run."""
-    digest = hashlib.sha256()
+    """Names the code that decides the numbers of a run, the flags of all studies' arms included."""
+    recipes = [(study.base, [(arm.name, arm.flags, arm.after) for arm in study.arms])
+               for study in tables.STUDIES.values()]
+    digest = hashlib.sha256(repr((recipes, tables.MEMORY)).encode())
     for name in _NUMERIC:
         path = PACKAGE / name
         for file in sorted(path.rglob("*.py")) if path.is_dir() else [path]:
@@ -148,9 +151,9 @@ def _run(command: Sequence[str], log: pathlib.Path) -> tuple[int, float]:
         child = subprocess.Popen([sys.executable, "-m", *command], stdout=file, stderr=subprocess.STDOUT)
         try:
             code = child.wait()
-        except KeyboardInterrupt:  # the terminal interrupted the child too
+        except KeyboardInterrupt:  # the terminal interrupted the child too, which saves
             child.wait()
-            raise
+            code = 130
     return code, _children_s() - before
 
 

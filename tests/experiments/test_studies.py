@@ -6,6 +6,7 @@ import os
 import pathlib
 import subprocess
 import sys
+import types
 
 import numpy as np
 import pytest
@@ -235,6 +236,59 @@ def test_runs_that_results_have_scores_of_are_not_made_again_even_where_their_fo
     results = json.loads((out / report.RESULTS).read_text())
     assert results["command"] == "the first sitting's" and results["runs"]["NPT"]["0"]["steps"] == 400
     assert results["runs"]["PTF"]["0"] is None
+
+
+def test_results_at_both_places_are_held_against_the_study_and_their_runs_put_together(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(command_line, "prepare_compiler", lambda: None)
+    out = _recorded(tmp_path, {"NPT": {"0": _run_of(20.0)}})
+    here = tmp_path / "occupancy-town"
+    here.mkdir()
+    text = (out / report.RESULTS).read_text()
+    (here / report.RESULTS).write_text(json.dumps(json.loads(text) | {"runs": {"PTO": {"0": _run_of(21.0)}}}))
+    call = lambda: command_line.run(study_command.Options, study_command.run, program="run", arguments=[
+        "occupancy", "--only-report", "--seeds=1", f"--runs-dir={tmp_path}", f"--out={out}"])
+    assert call() == 0
+    for place in (here, out):
+        kept = report.complete(json.loads((place / report.RESULTS).read_text()))
+        assert set(kept) == {"NPT", "PTO"}
+    (out / report.RESULTS).write_text(text.replace('"occupancy"', '"fusion"'))
+    assert call() == 1 and "holds study 'fusion'" in capsys.readouterr().err
+    assert '"fusion"' in (out / report.RESULTS).read_text()
+
+
+def test_a_recording_without_the_splits_that_are_judged_is_refused_before_anything_trains(
+        tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(command_line, "prepare_compiler", lambda: None)
+    monkeypatch.setattr(queue, "make", lambda *_: pytest.fail("trained"))
+    description = types.SimpleNamespace(splits=("train", "val0", "val1"))
+    monkeypatch.setattr(study_command.sources, "open_recording", lambda path: types.SimpleNamespace(
+        description=description))
+    code = command_line.run(study_command.Options, study_command.run, program="run", arguments=[
+        "fusion", f"--data={tmp_path / 'rec'}", f"--runs-dir={tmp_path / 'runs'}"])
+    assert code == 1 and not (tmp_path / "runs").exists()
+    assert "has the splits train, val0, val1, but a study judges val_rl, val_ds" in capsys.readouterr().err
+
+
+def test_the_time_of_a_sitting_that_is_interrupted_counts(tmp_path, monkeypatch):
+    job = queue.jobs(tables.FUSION, "smoke", 1)[0]
+    (tmp_path / job.name).mkdir()
+    (tmp_path / job.name / "config.json").touch()
+
+    class Child:
+        waits = iter((KeyboardInterrupt, 0))
+
+        def wait(self):
+            if (ended := next(self.waits)) is KeyboardInterrupt:
+                raise ended
+            return ended
+
+    monkeypatch.setattr(queue.subprocess, "Popen", lambda *_, **__: Child())
+    used_s = iter((1.0, 6.0))
+    monkeypatch.setattr(queue, "_children_s", lambda: next(used_s))
+    monkeypatch.setattr(queue, "_set_aside", lambda run: None)
+    with pytest.raises(KeyboardInterrupt):
+        queue.make(tables.FUSION, "smoke", job, tmp_path, lambda line: None)
+    assert json.loads((tmp_path / job.name / queue.COST).read_text()) == {"processor_s": 5.0}
 
 
 def test_runs_that_were_judged_by_two_cards_are_not_compared(tmp_path):

@@ -20,7 +20,7 @@ with late.imports():
     from muvo_jax.data.checkup import examination, judgements
     from muvo_jax.ops import voxels as voxel_ops
     from muvo_jax.training import screen
-    from muvo_jax.viz import canvas, checks
+    from muvo_jax.viz import canvas, checks, panels
 
 
 @dataclasses.dataclass(frozen=True)
@@ -122,7 +122,8 @@ def draw(described: schema.RecordingDescription, result: examination.Checkup, ou
         elif "image" in frame:
             parts.append(canvas.caption(frame["image"], "image"))
         if "points_m" in frame:
-            parts.append(checks.above(frame["points_m"], *_voxels(frame, described)))
+            parts.append(checks.above(frame["points_m"], *_voxels(frame, described),
+                                      ego_m=panels.ego_of(described.contract)))
         if parts:
             title = f"{sample.sequence.name}, frame {int(frame['frame_id'])}"
             page = canvas.margin(canvas.caption(canvas.stack(parts, axis=0), title, size_px=17))

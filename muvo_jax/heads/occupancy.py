@@ -89,7 +89,7 @@ _METRICS = {
 
 def _draw_above(frame: np.ndarray, scene, columns_px: int) -> np.ndarray:
     from muvo_jax.viz import panels  # with Pillow, which imagining does not need
-    return panels.occupancy_from_above(frame, scene.grid, columns_px=columns_px)
+    return panels.occupancy_from_above(frame, scene.grid, columns_px=columns_px, ego_m=scene.ego_m)
 
 
 def _draw_ahead(frame: np.ndarray, scene, columns_px: int) -> np.ndarray:

@@ -108,7 +108,7 @@ def _draw_ranges(frame: np.ndarray, scene, columns_px: int) -> np.ndarray:
 def _draw_points(frame: np.ndarray, scene, columns_px: int) -> np.ndarray:
     from muvo_jax.viz import panels
     return panels.birds_eye(points.range_view_points(frame, scene.threshold_m), extent_m=scene.extent_m,
-                            side_px=columns_px, height_span_m=panels.height_span(scene.grid))
+                            side_px=columns_px, height_span_m=panels.height_span(scene.grid), ego_m=scene.ego_m)
 
 
 def _nearness(range_m: types.Array) -> types.Array:

@@ -35,14 +35,14 @@ def lidar_in_image(image: np.ndarray, points_m: np.ndarray, intrinsics: np.ndarr
 
 
 def above(points_m: np.ndarray, occupancy: np.ndarray | None, grid: config_lib.VoxelGrid | None,
-          side_px: int = 384) -> np.ndarray:
+          side_px: int = 384, *, ego_m: tuple[float, float]) -> np.ndarray:
     """Points from above, beside the voxels (where there are any) with the same points as white dots over them."""
     extent_m = 48.0 if grid is None else max(abs(grid.origin_m[0]), abs(grid.origin_m[1]))
     heights = {} if grid is None else {"height_span_m": panels.height_span(grid)}  # of the voxels beside them
-    seen = panels.birds_eye(points_m, extent_m=extent_m, side_px=side_px, **heights)
+    seen = panels.birds_eye(points_m, extent_m=extent_m, side_px=side_px, ego_m=ego_m, **heights)
     parts = [canvas.caption(seen, "points from above")]
     if occupancy is not None and grid is not None:
-        voxels = panels.occupancy_from_above(occupancy, grid, columns_px=side_px)
+        voxels = panels.occupancy_from_above(occupancy, grid, columns_px=side_px, ego_m=ego_m)
         scale = side_px / (grid.shape[1] * grid.voxel_size_m)
         rows = np.floor((grid.origin_m[0] + grid.shape[0] * grid.voxel_size_m - points_m[:, 0]) * scale).astype(int)
         columns = np.floor((grid.origin_m[1] + grid.shape[1] * grid.voxel_size_m - points_m[:, 1]) * scale).astype(int)

@@ -18,7 +18,14 @@ UNKNOWN = (44, 47, 58)
 EGO = (250, 250, 250)
 SKY = (20, 23, 31)
 MOST_CLASSES = 32
-EGO_LENGTH_M, EGO_WIDTH_M = 4.6, 2.0
+EGO_WIDTH_M = 2.0
+# From a car's rear end to its front, in the ego frame.
+OVER_REAR_AXLE_M, OVER_MIDDLE_M = (-1.1, 3.7), (-2.3, 2.3)
+
+
+def ego_of(contract: config_lib.ActionContract) -> tuple[float, float]:
+    """From where to where the car reaches: a bicycle's ego frame lies over its rear axle, CARLA's over the middle."""
+    return OVER_REAR_AXLE_M if contract.kinematics == "bicycle" else OVER_MIDDLE_M
 
 
 def camera(image: np.ndarray) -> np.ndarray:
@@ -61,7 +68,8 @@ def height_fraction(height_m: np.ndarray, height_span_m: tuple[float, float]) ->
 
 
 def birds_eye(points_m: np.ndarray, *, extent_m: float, side_px: int = 256,
-              height_span_m: tuple[float, float] = (0.0, 6.0)) -> np.ndarray:
+              height_span_m: tuple[float, float] = (0.0, 6.0),
+              ego_m: tuple[float, float] = OVER_REAR_AXLE_M) -> np.ndarray:
     """Points [P, 3] (ego frame) from above, coloured by height, higher over lower; rings every 10 m around the ego."""
     picture = canvas.blank(side_px, side_px, NO_RETURN)
     scale = side_px / (2.0 * extent_m)
@@ -74,11 +82,12 @@ def birds_eye(points_m: np.ndarray, *, extent_m: float, side_px: int = 256,
     inside = (rows >= 0) & (rows < side_px) & (columns >= 0) & (columns < side_px)
     colours = canvas.colour_map(height_fraction(points_m[:, 2], height_span_m), canvas.HEIGHT_COLOURS)
     picture[rows[inside], columns[inside]] = colours[inside]
-    return _ego_box(picture, scale, extent_m, extent_m)
+    return _ego_box(picture, scale, extent_m, extent_m, ego_m)
 
 
 def occupancy_from_above(occupancy: np.ndarray, grid: config_lib.VoxelGrid,
-                         height_span_m: tuple[float, float] | None = None, columns_px: int | None = None) -> np.ndarray:
+                         height_span_m: tuple[float, float] | None = None, columns_px: int | None = None,
+                         ego_m: tuple[float, float] = OVER_REAR_AXLE_M) -> np.ndarray:
     """Voxels [X, Y, Z] (0 empty, 1 occupied, 255 unknown) from above: each column in the colour of its highest voxel.
 
     Columns of which nothing is known are dark grey, known and empty ones near black.
@@ -95,7 +104,7 @@ def occupancy_from_above(occupancy: np.ndarray, grid: config_lib.VoxelGrid,
     scale = picture.shape[1] / grid.shape[1]
     front_m = grid.origin_m[0] + grid.shape[0] * grid.voxel_size_m
     left_m = grid.origin_m[1] + grid.shape[1] * grid.voxel_size_m
-    return _ego_box(np.ascontiguousarray(picture), scale / grid.voxel_size_m, front_m, left_m)
+    return _ego_box(np.ascontiguousarray(picture), scale / grid.voxel_size_m, front_m, left_m, ego_m)
 
 
 def height_span(grid: config_lib.VoxelGrid, top_m: float = 6.0) -> tuple[float, float]:
@@ -111,7 +120,7 @@ def occupancy_from_behind(occupancy: np.ndarray, grid: config_lib.VoxelGrid, *, 
     shaded by their direction and fade with distance. What lies behind the ego is left out: it would hide the rest.
     """
     directions, eye_m = _oblique_camera(size_px, grid)
-    behind = max(0, int((-EGO_LENGTH_M - grid.origin_m[0]) / grid.voxel_size_m))
+    behind = max(0, int((2.0 * OVER_MIDDLE_M[0] - grid.origin_m[0]) / grid.voxel_size_m))
     occupied = occupancy == types.OCCUPANCY_OCCUPIED
     occupied[:behind] = False
     voxel, axis, distance_m = _march(occupied, grid, eye_m, directions)
@@ -162,11 +171,11 @@ def _rings(picture: np.ndarray, scale: float, extent_m: float) -> np.ndarray:
     return np.array(image)
 
 
-def _ego_box(picture: np.ndarray, scale: float, front_m: float, left_m: float) -> np.ndarray:
+def _ego_box(picture: np.ndarray, scale: float, front_m: float, left_m: float,
+             ego_m: tuple[float, float]) -> np.ndarray:
     image = Image.fromarray(picture)
-    half_length, half_width = EGO_LENGTH_M / 2.0, EGO_WIDTH_M / 2.0
-    box = [(left_m - half_width) * scale, (front_m - half_length) * scale,
-           (left_m + half_width) * scale, (front_m + half_length) * scale]
+    box = [(left_m - EGO_WIDTH_M / 2.0) * scale, (front_m - ego_m[1]) * scale,
+           (left_m + EGO_WIDTH_M / 2.0) * scale, (front_m - ego_m[0]) * scale]
     ImageDraw.Draw(image).rectangle(box, outline=EGO)
     return np.array(image)
 

@@ -47,12 +47,14 @@ class Moment:
 
 @dataclasses.dataclass(frozen=True)
 class Scene:
-    """What all frames of a picture share: the sensors' geometry, the pace and the ranges of the colour scales."""
+    """What all frames of a picture share: the sensors' geometry, the pace, the ranges of the colour scales, and from
+    where to where the car reaches."""
 
     grid: config_lib.VoxelGrid
     frame_s: float
     far_m: float = 60.0
     threshold_m: float = 1.0
+    ego_m: tuple[float, float] = panels.OVER_REAR_AXLE_M
 
     @property
     def extent_m(self) -> float:
@@ -62,7 +64,8 @@ class Scene:
     @classmethod
     def of(cls, config: config_lib.Config) -> Scene:
         return cls(grid=config.model.voxels, frame_s=config.data.stride / config.contract.rate_hz,
-                   threshold_m=config.evaluation.return_threshold_m)
+                   threshold_m=config.evaluation.return_threshold_m,
+                   ego_m=panels.ego_of(config.contract))
 
 
 def views_of_batch(batch: types.Batch, sample: int) -> list[View]:

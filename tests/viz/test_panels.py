@@ -5,6 +5,7 @@ import pytest
 from PIL import Image
 
 from muvo_jax import config as config_lib
+from muvo_jax.agents import rewards
 from muvo_jax.viz import canvas, curves, panels, sheets
 
 GRID = config_lib.VoxelGrid(shape=(16, 12, 8), voxel_size_m=1.0, origin_m=(-8.0, -6.0, -1.0))
@@ -28,6 +29,16 @@ def test_colour_map_meets_its_anchors_and_clips():
     colours = canvas.colour_map(np.array([-1.0, 0.0, 0.25, 0.5, 1.0, 2.0, np.nan]), anchors)
     np.testing.assert_array_equal(
         colours, [(0, 0, 0), (0, 0, 0), (50, 0, 0), (100, 0, 0), (100, 200, 0), (100, 200, 0), (0, 0, 0)])
+
+
+@pytest.mark.parametrize(("kinematics", "rear_m", "front_m"), [
+    ("bicycle", rewards.EgoBox().rear_m, rewards.EgoBox().front_m), ("none", -2.3, 2.3)])
+def test_the_car_is_drawn_where_it_is(kinematics, rear_m, front_m):
+    ego_m = panels.ego_of(config_lib.ActionContract(kinematics=kinematics))
+    for picture in (panels.birds_eye(np.zeros((0, 3)), extent_m=8.0, side_px=480, ego_m=ego_m),
+                    panels.occupancy_from_above(np.zeros(GRID.shape, np.uint8), GRID, columns_px=360, ego_m=ego_m)):
+        rows = np.flatnonzero((picture == panels.EGO).all(axis=-1).any(axis=1))
+        np.testing.assert_allclose(8.0 - rows[[-1, 0]] / 30.0, [rear_m, front_m], atol=0.05)
 
 
 def test_camera_clips_predictions_and_keeps_recorded_pixels():

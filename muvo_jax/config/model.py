@@ -28,7 +28,6 @@ from muvo_jax.limits import COUNT, SHARE, Limits, RangeError, above, check
 
 BACKBONES = ("resnet18", "mobilevitv2_100")
 _DRAWN = ("image", "range_view", "depth", "semantic_image", "semantic_range_view", "birds_eye")  # decoder_channels wide
-_GUIDED = ("image", "range_view", "occupancy")  # in the order of LastSeen.guided_channels
 
 
 @dataclasses.dataclass(frozen=True)
@@ -151,11 +150,9 @@ class ModelConfig:
     def _check_widths(self) -> None:
         """Some layers have a half or an eighth of a width; that must leave a channel."""
         guess, heads = self.first_guess, self.heads
-        guided: dict[str, int] = {}
-        if isinstance(guess, LastSeen) and self.lidar is not None:
-            guided = dict(zip(_GUIDED, guess.guided_channels, strict=True))
-            if self.camera is None:
-                del guided["image"]
+        guided = guess.widths if isinstance(guess, LastSeen) and self.lidar is not None else {}
+        if self.camera is None:
+            guided.pop("image", None)
         drawn = [head for head in heads if head in _DRAWN and head not in guided]
         for field, least, needed, reason in (
                 ("decoder_channels", 8, drawn, f"the heads {', '.join(drawn)}"),

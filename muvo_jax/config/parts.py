@@ -219,6 +219,11 @@ class LastSeen:
                              f"it, but model.first_guess.memory_frames is {self.memory_frames}; set it to "
                              f"{FLOW_LAGS + 1} or more.")
 
+    @property
+    def widths(self) -> dict[str, int]:
+        """Head -> the width of its decoder that sees the memory."""
+        return dict(zip(("image", "range_view", "occupancy"), self.guided_channels, strict=True))
+
 
 Latent = VectorLatent | TokenLatent
 Lidar = RangeViewLidar | PillarLidar

@@ -90,7 +90,7 @@ HEAD = head.Head(
     build=lambda model: decoders.of_image(model, 3), scales=head.SCALES, tokens="image", initial_bias=0.5,
     losses=_losses, weights=_weights, average=_average,
     guide=head.Guide(view="image", plane=lambda model: model.image_size,
-                     width=lambda model: as_kind(model.first_guess, LastSeen).guided_channels[0],
+                     width=lambda model: as_kind(model.first_guess, LastSeen).widths["image"],
                      channels=lambda model, scale: 3, shrink=tokens.IMAGE_SHRINK, see=_see, compose=_compose,
                      blurs=True),
     frames=head.Frames(

@@ -126,7 +126,7 @@ HEAD = head.Head(
     build=lambda model: decoders.of_voxels(model, 2), scales=head.SCALES, tokens="occupancy", initial_bias=0.0,
     losses=_losses, weights=_weights, average=_average,
     guide=head.Guide(view="occupancy", plane=lambda model: model.voxels.shape[:2],
-                     width=lambda model: as_kind(model.first_guess, LastSeen).guided_channels[2],
+                     width=lambda model: as_kind(model.first_guess, LastSeen).widths["occupancy"],
                      channels=lambda model, scale: 2 * model.voxels.shape[2] // scale, shrink=8, see=_see,
                      compose=_compose),
     frames=head.Frames(

@@ -153,7 +153,7 @@ HEAD = head.Head(
     build=lambda model: decoders.of_range_view(model, 4), scales=head.SCALES, tokens="range_view", finish=_finish,
     initial_bias=0.0, losses=_losses, weights=_weights, average=_average,
     guide=head.Guide(view="range_view", plane=lambda model: (model.range_view.rows, model.range_view.columns),
-                     width=lambda model: as_kind(model.first_guess, LastSeen).guided_channels[1],
+                     width=lambda model: as_kind(model.first_guess, LastSeen).widths["range_view"],
                      channels=lambda model, scale: 5, shrink=tokens.RANGE_VIEW_SHRINK, see=_see, compose=_compose),
     frames=head.Frames(
         field="range_view", of=lambda value, model: value, sums=_sums, error=_error, error_name="range",

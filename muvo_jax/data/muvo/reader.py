@@ -216,7 +216,7 @@ class MuvoRecording:
         faults: list[schema.DataError] = []
         told: dict[muvo_tags.TagSet, str] = {}  # by which run first
         for run in {run.name.rpartition("/")[0]: run for run in kept}.values():
-            of_run = muvo_tags.of_run(run)
+            of_run = muvo_tags.of_run(run, self._files[run.name])
             every, ground, faults = every + of_run.every, ground + of_run.ground, faults + of_run.faults
             if (found := muvo_tags.recognise(of_run.every, of_run.ground, str(run.folder))) is not None:
                 told.setdefault(found, run.name)

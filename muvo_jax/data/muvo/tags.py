@@ -8,7 +8,7 @@ under the car is a road. Where neither helps, nothing is guessed.
 from __future__ import annotations
 
 import pathlib
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from typing import Literal, NamedTuple, get_args
 
 import numpy as np
@@ -50,16 +50,16 @@ class RunTags(NamedTuple):
     faults: list[schema.DataError]
 
 
-def of_run(run: muvo_runs.Run) -> RunTags:
+def of_run(run: muvo_runs.Run, known: Mapping[str, muvo_runs.KindFiles]) -> RunTags:
     """The tags that scans, voxels and pictures of a run hold, as far as they are there.
 
     Of each kind two files are looked at, a quarter and half of the way through the run; where one is damaged, which may
-    be of a kind that nobody reads, the next.
+    be of a kind that nobody reads, the next. `known` has the files of the kinds that are read.
     """
     found = RunTags([], [], [])
     for kind, read in (("points_semantic", _of_scan), ("voxel", _of_voxels), ("depth_semantic", _of_picture)):
         try:
-            there = muvo_runs.find_files(run, kind)
+            there = known[kind] if kind in known else muvo_runs.find_files(run, kind)
         except schema.DataError as error:
             found.faults.append(error)
             continue

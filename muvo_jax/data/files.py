@@ -217,8 +217,12 @@ def numbered(folder: pathlib.Path, suffixes: str | Sequence[str]) -> dict[int, s
 def write_atomically(path: pathlib.Path, content: str | bytes) -> None:
     """Writes a file such that it is there whole or not at all."""
     draft = path.with_name(f".{path.name}.{uuid.uuid4().hex}")  # other machines may have this process id, too
-    draft.write_bytes(content.encode() if isinstance(content, str) else content)
-    os.replace(draft, path)
+    try:
+        draft.write_bytes(content.encode() if isinstance(content, str) else content)
+        os.replace(draft, path)
+    except OSError:
+        draft.unlink(missing_ok=True)  # no later attempt writes over it
+        raise
 
 
 def npz_bytes(arrays: Mapping[str, np.ndarray]) -> bytes:

@@ -67,3 +67,13 @@ def test_two_machines_of_one_process_id_may_write_one_file(tmp_path, monkeypatch
     monkeypatch.setattr(os, "replace", replace_after_the_other)
     files.write_atomically(path, "ours")
     assert path.read_text() == "ours" and list(tmp_path.iterdir()) == [path]
+
+
+def test_a_file_that_cannot_be_written_leaves_no_draft(tmp_path, monkeypatch):
+    def full(draft, target):
+        raise OSError("No space left on device")
+
+    monkeypatch.setattr(os, "replace", full)
+    with pytest.raises(OSError, match="No space left"):
+        files.write_atomically(tmp_path / "plan.json", "ours")
+    assert not list(tmp_path.iterdir())

@@ -21,6 +21,7 @@ MOST_CLASSES = 32
 EGO_WIDTH_M = 2.0
 # From a car's rear end to its front, in the ego frame.
 OVER_REAR_AXLE_M, OVER_MIDDLE_M = (-1.1, 3.7), (-2.3, 2.3)
+_BEHIND_M = 4.6  # farther behind things would hide what is ahead
 
 
 def ego_of(contract: config_lib.ActionContract) -> tuple[float, float]:
@@ -120,7 +121,7 @@ def occupancy_from_behind(occupancy: np.ndarray, grid: config_lib.VoxelGrid, *, 
     shaded by their direction and fade with distance. What lies behind the ego is left out: it would hide the rest.
     """
     directions, eye_m = _oblique_camera(size_px, grid)
-    behind = max(0, int((2.0 * OVER_MIDDLE_M[0] - grid.origin_m[0]) / grid.voxel_size_m))
+    behind = max(0, int((-_BEHIND_M - grid.origin_m[0]) / grid.voxel_size_m))
     occupied = occupancy == types.OCCUPANCY_OCCUPIED
     occupied[:behind] = False
     voxel, axis, distance_m = _march(occupied, grid, eye_m, directions)

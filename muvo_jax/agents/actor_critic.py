@@ -27,6 +27,8 @@ from muvo_jax.limits import COUNT, NOT_NEGATIVE, SHARE, above, check
 from muvo_jax.ops import precision
 from muvo_jax.types import Array
 
+_GONE = 1e-3  # a drive that is likelier to have ended counts as one that is as likely to
+
 
 @dataclasses.dataclass(frozen=True)
 class ActorCriticConfig:
@@ -209,7 +211,8 @@ def update(environment: environment_lib.Environment, config: ActorCriticConfig, 
     Steps after the end of an episode (params.max_steps_in_episode, if it is less than config.horizon) do not count.
     """
     seen, drawn, transitions = jax.lax.stop_gradient(imagine(environment, config, params, key, learner.actor))
-    drives = lambda actor: (seen, drawn, transitions.reward, transitions.terminated, transitions.truncated)
+    reward, ends = _to_an_unharmed_car(transitions.reward, transitions.terminated, transitions.terms.get("unharmed"))
+    drives = lambda actor: (seen, drawn, reward, ends, transitions.truncated)
     return _learn(config, learner, drives, score=1.0)
 
 
@@ -232,26 +235,36 @@ def improve(environment: environment_lib.Environment, config: ActorCriticConfig,
             drawn = mean + std * noise[step]
             return jnp.tanh(drawn), drawn
 
-        seen, reward, terminated, drawn = futures_lib.drive(environment, futures, start, act)
-        return seen, drawn, reward, terminated, None
+        seen, reward, terminated, drawn, unharmed = futures_lib.drive_unharmed(environment, futures, start, act)
+        return seen, drawn, *_to_an_unharmed_car(reward, terminated, unharmed), None
 
     return _learn(config, learner, drives, score=config.score)
 
 
+def _to_an_unharmed_car(reward, terminated, unharmed):
+    """What steps are worth to a car that came to them unharmed, and how likely they end its drive, [H, N]; as they are
+    where the reward does not say how unharmed it is after them. So values are those of unharmed cars."""
+    ends = terminated.astype(jnp.float32)
+    if unharmed is None:
+        return reward, ends
+    before = jnp.maximum(jnp.concatenate([jnp.ones_like(unharmed[:1]), unharmed[:-1]]), _GONE)
+    return reward / before, 1.0 - (1.0 - ends) * unharmed / before
+
+
 def _learn(config, learner, drives, score):
     """One step of the optimiser. drives: actor -> observations [H + 1, N, F], actions before tanh [H, N, 2], and
-    rewards, ends and truncations (or None) [H, N]."""
+    rewards, ends (bool, or how likely) and truncations (or None) [H, N]."""
     hold = jax.lax.stop_gradient
 
     def loss(networks):
         actor, critic = networks
-        seen, drawn, reward, terminated, truncated = drives(actor)
-        going_on = 1.0 - terminated.astype(jnp.float32)
+        seen, drawn, reward, ends, truncated = drives(actor)
+        going_on = 1.0 - ends.astype(jnp.float32)
         values = _value(config, learner.slow_critic, seen)
         returns = lambda_returns(reward, config.discount * going_on, values[1:], config.lambda_, truncated)
         # Steps after a predicted collision, or after the end of an episode, do not count.
         alive = jnp.cumprod(going_on if truncated is None else going_on * ~truncated, axis=0)
-        weight = jnp.concatenate([jnp.ones_like(alive[:1]), alive[:-1]])
+        weight = hold(jnp.concatenate([jnp.ones_like(alive[:1]), alive[:-1]]))
         spread = hold(jnp.percentile(returns, 95) - jnp.percentile(returns, 5))
         scale = (1.0 - config.scale_rate) * learner.scale + config.scale_rate * spread
         unit = jnp.maximum(scale, 1.0)
@@ -267,7 +280,7 @@ def _learn(config, learner, drives, score):
         critic_loss = (weight * (predicted - symlog(hold(returns))) ** 2).mean()
         return actor_loss + critic_loss, (scale, {
             "actor_loss": actor_loss, "critic_loss": critic_loss, "entropy": entropy.mean(),
-            "return": returns[0].mean(), "reward": reward.mean(), "terminated": terminated.mean()})
+            "return": returns[0].mean(), "reward": (weight * reward).mean(), "terminated": ends.mean()})
 
     gradients, (scale, metrics) = jax.grad(loss, has_aux=True)((learner.actor, learner.critic))
     updates, opt_state = _optimizer(config).update(gradients, learner.opt_state)

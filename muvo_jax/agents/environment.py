@@ -205,7 +205,7 @@ class Environment:
         """The first moment of an episode from `start`, int32 index into the bank."""
         bank = params.bank
         return EnvState(bank.latent[start], motion_ops.at_rest_of_frame(bank.speed_mps[start]), start, jnp.int32(0),
-                        jnp.float32(0), jnp.bool_(False))
+                        jnp.float32(0), jnp.bool_(False), jnp.float32(1))
 
     def observe(self, state: EnvState, params: EnvParams) -> Any:
         """The observation of a state."""
@@ -251,10 +251,12 @@ class Environment:
             motion = motion_ops.moved(motion, full["ego_motion"])
         route_map = None if params.bank.route_map is None else params.bank.route_map[state.start]
         moment = rewards.Moment(state.motion, motion, action, latent.features, read, route_map,
-                                params.route_of(state), self.seen_ahead(params, state, after_steps=state.time + 1))
+                                params.route_of(state), self.seen_ahead(params, state, after_steps=state.time + 1),
+                                state.unharmed)
         reward, terminated, terms = self._reward(moment)
         reward = self.caution.believed(reward, state.time + 1)
-        after = EnvState(latent, motion, state.start, state.time + 1, reward, terminated)
+        after = EnvState(latent, motion, state.start, state.time + 1, reward, terminated,
+                         terms.get("unharmed", state.unharmed))
         truncated = after.time >= params.max_steps_in_episode
         return after, Transition(self._observe(after, params, full, coarse), reward, terminated, truncated, terms), read
 

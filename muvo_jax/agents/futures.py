@@ -196,11 +196,12 @@ def look(environment: environment_lib.Environment, here: Around, motion: Motion)
                         config=environment.reward_config, pooled=environment.pooled)
 
 
-def advance(environment: environment_lib.Environment, there: Around, motion: Motion, action: Array,
-            step: Array) -> tuple[Motion, Array, Array, dict[str, Array]]:
+def advance(environment: environment_lib.Environment, there: Around, motion: Motion, action: Array, step: Array,
+            unharmed: Array | float) -> tuple[Motion, Array, Array, dict[str, Array]]:
     """One car drives one step on the bicycle's path, its step-th: Motion, reward, terminated and the reward's terms.
 
     there: around it after the step.
+    unharmed: as EnvState's, before it.
     """
     config, grid, touched = environment.reward_config, environment.model.config.voxels, None
     after = motion_ops.drive(motion, action, environment.contract, environment.periods)
@@ -211,7 +212,7 @@ def advance(environment: environment_lib.Environment, there: Around, motion: Mot
         if there.seen is not None:
             touched = jnp.maximum(touched, rewards.box_collision(there.seen, places, grid, config.box))
         touched = touched.max()
-    moment = rewards.Moment(motion, after, action, motion.speed_mps, {}, route=there.route)
+    moment = rewards.Moment(motion, after, action, motion.speed_mps, {}, route=there.route, unharmed=unharmed)
     reward, terminated, terms = rewards.weighed(moment, touched, contract=environment.contract,
                                                 step_s=environment.step_s, config=config)
     return after, environment.caution.believed(reward, step), terminated, terms
@@ -232,18 +233,27 @@ def drive(environment: environment_lib.Environment, futures: Futures, start: Mot
       observations [H + 1, N, CHANNELS], rewards [H, N], terminated bool [H, N], and what `act` returned beside the
       actions, [H, N, ...].
     """
+    observed, reward, terminated, extra, _ = drive_unharmed(environment, futures, start, act)
+    return observed, reward, terminated, extra
+
+
+def drive_unharmed(environment: environment_lib.Environment, futures: Futures, start: Motion, act: Act):
+    """As `drive`, and beside that EnvState's `unharmed` after each step, [H, N]."""
     surroundings = lambda step: around(environment, futures, slice(None), step)
     observe = lambda motion, step: jax.vmap(functools.partial(look, environment))(surroundings(step), motion)
 
-    def step(motion, index):
+    def step(carry, index):
+        motion, unharmed = carry
         observation = observe(motion, index)
         action, extra = act(observation, index)
-        after, reward, terminated, _ = jax.vmap(functools.partial(advance, environment), (0, 0, 0, None))(
-            surroundings(index + 1), motion, action, index + 1)
-        return after, (observation, reward, terminated, extra)
+        after, reward, terminated, terms = jax.vmap(functools.partial(advance, environment), (0, 0, 0, None, 0))(
+            surroundings(index + 1), motion, action, index + 1, unharmed)
+        unharmed = terms.get("unharmed", unharmed)
+        return (after, unharmed), (observation, reward, terminated, extra, unharmed)
 
-    last, (observed, reward, terminated, extra) = jax.lax.scan(step, start, jnp.arange(futures.horizon))
-    return jnp.concatenate([observed, observe(last, futures.horizon)[None]]), reward, terminated, extra
+    (last, _), (observed, *driven) = jax.lax.scan(step, (start, jnp.ones_like(start.speed_mps)),
+                                                  jnp.arange(futures.horizon))
+    return jnp.concatenate([observed, observe(last, futures.horizon)[None]]), *driven
 
 
 @flax.struct.dataclass
@@ -285,7 +295,7 @@ class SharedFutures:
         key_which, key_start = jax.random.split(key)
         start = jax.random.randint(key_which, (), 0, params.futures.count, jnp.int32)
         motion = jax.tree.map(lambda leaf: leaf[0], scattered(key_start, params.futures.speed_mps[start][None]))
-        state = EnvState(_NO_LATENT, motion, start, jnp.int32(0), jnp.float32(0), jnp.bool_(False))
+        state = EnvState(_NO_LATENT, motion, start, jnp.int32(0), jnp.float32(0), jnp.bool_(False), jnp.float32(1))
         return self.observe(state, params), state
 
     def observe(self, state: EnvState, params: FuturesParams) -> Array:
@@ -297,8 +307,10 @@ class SharedFutures:
         del key
         action = jnp.clip(checks.one_action(action, (), "SharedFutures.step", clips=True), -1.0, 1.0)
         there = around(self.environment, params.futures, state.start, state.time + 1)
-        motion, reward, terminated, terms = advance(self.environment, there, state.motion, action, state.time + 1)
-        after = EnvState(_NO_LATENT, motion, state.start, state.time + 1, reward, terminated)
+        motion, reward, terminated, terms = advance(self.environment, there, state.motion, action, state.time + 1,
+                                                    state.unharmed)
+        after = EnvState(_NO_LATENT, motion, state.start, state.time + 1, reward, terminated,
+                         terms.get("unharmed", state.unharmed))
         return after, Transition(look(self.environment, there, motion), reward, terminated,
                                  after.time >= params.max_steps_in_episode, terms)
 

@@ -26,4 +26,5 @@ def town_rewards(environment: environment_lib.Environment, drive: closed_loop.Dr
              "discomfort": rewards.discomfort(moment, contract, environment.step_s, config),
              "speeding": rewards.speeding(moment, config),
              "collision": jnp.asarray([situation.collided for situation in drive.situations[1:]], jnp.float32)}
-    return np.asarray(rewards.total(terms, after.speed_mps, step_s=environment.step_s, config=config))
+    unharmed = rewards.unharmed_before(terms["collision"], config)
+    return np.asarray(rewards.total(terms, after.speed_mps, unharmed, step_s=environment.step_s, config=config))

@@ -49,9 +49,11 @@ class RewardConfig:
     Attributes:
       progress: per metre along the route, divided by the metres of a step at `speed_limit_mps`; what is more than those
         earns nothing.
-      collision: times the collision probability above `tolerated_collision`, which is about what a car parked beside
-        the lane gives. It must cost more than all that a plan or an episode can earn until then: a drive that ends has
+      collision: times the probability that the drive collides in the step; what comes later counts as far as it has not
+        (see `weighed`). It must cost more than all that a plan or an episode can earn until then: a drive that ends has
         no more to lose, and where collisions are cheap it is worth as much as braking in time.
+      tolerated_collision: a collision probability up to this counts as none; it is about what a car parked beside the
+        lane gives.
       comfort, speeding: times the respective penalty. The limit is the best speed whatever `speeding` is; equal to
         progress, a metre per second too fast costs what one too slow costs.
       terminal_collision: an imagined drive ends where the collision probability exceeds this; at 1 it never ends.
@@ -100,6 +102,7 @@ class Moment:
       route: the line that it shows, in the same frame as the motions, or None.
       seen: float32 [..., X, Y], 1 where something stood at the height of the car when the start was observed (see
         `seen_plan`), in the same frame; None where that is unknown.
+      unharmed: float32 [...], the probability that the drive has not collided before the step.
     """
 
     before: Motion
@@ -110,6 +113,7 @@ class Moment:
     route_map: Array | None = None
     route: route_lib.Route | None = None
     seen: Array | None = None
+    unharmed: Array | float = 1.0
 
 
 def obstacle_plan(occupancy: Array, grid: config_lib.VoxelGrid, box: EgoBox, *, pooled: bool = True) -> Array:
@@ -299,32 +303,50 @@ def weighed(moment: Moment, touched: Array | None, *, contract: config_lib.Actio
             config: RewardConfig) -> tuple[Array, Array, dict[str, Array]]:
     """The driving reward where the collision probability `touched` [...] is known; None leaves it out.
 
-    reward = progress * progress_m / (limit * step_s) - collision * max(0, p - q) / (1 - q)
-             - comfort * discomfort - speeding * speeding, q being config.tolerated_collision; gains above the limit
-             are divided by speed / limit
+    reward = unharmed * (progress * progress_m / (limit * step_s) - collision * likely(p) - comfort * discomfort
+             - speeding * speeding); gains above the limit are divided by speed / limit
+
+    It is what is to be expected where the drive ends in each step with probability likely(p): all contacts of a drive
+    together cost no more than one certain collision, and after them there is as little to gain.
 
     Returns:
-      reward [...], terminated bool [...] (p above config.terminal_collision), and the terms by name.
+      reward [...], terminated bool [...] (p above config.terminal_collision), and the terms by name: among them
+      "unharmed", the probability that the drive has not collided after the step either.
     """
     terms = {"progress_m": progress_m(moment, config), "discomfort": discomfort(moment, contract, step_s, config),
              "speeding": speeding(moment, config)}
     if touched is not None:
-        terms["collision"] = touched
-    reward = total(terms, moment.after.speed_mps, step_s=step_s, config=config)
+        terms |= {"collision": touched, "unharmed": moment.unharmed * (1.0 - likely(touched, config))}
+    reward = total(terms, moment.after.speed_mps, moment.unharmed, step_s=step_s, config=config)
     ends = jnp.zeros(reward.shape, jnp.bool_) if touched is None else touched > config.terminal_collision
     return reward, ends, terms
 
 
-def total(terms: Mapping[str, Array], speed_mps: Array, *, step_s: float, config: RewardConfig) -> Array:
-    """The driving reward [...] of its terms, as `weighed` says; without the term "collision" nothing is touched."""
+def likely(touched: Array, config: RewardConfig) -> Array:
+    """How likely a step of collision probability p ends the drive: max(0, p - q) / (1 - q), q what is tolerated."""
+    return jnp.maximum(touched - config.tolerated_collision, 0.0) / (1.0 - config.tolerated_collision)
+
+
+def unharmed_before(touched: Array, config: RewardConfig, at_first: Array | float = 1.0) -> Array:
+    """The probability [..., H] that a drive has not collided before each step, from the collision probabilities
+    [..., H] of all, `at_first` before the first."""
+    after = at_first * jnp.cumprod(1.0 - likely(touched, config), axis=-1)
+    return jnp.concatenate([jnp.broadcast_to(at_first, (*touched.shape[:-1], 1)), after[..., :-1]], axis=-1)
+
+
+def total(terms: Mapping[str, Array], speed_mps: Array, unharmed: Array | float, *, step_s: float,
+          config: RewardConfig) -> Array:
+    """The driving reward [...] of its terms, as `weighed` says; without the term "collision" nothing is touched.
+
+    unharmed: as Moment's, before the step.
+    """
     gained = terms["progress_m"] / (config.speed_limit_mps * step_s)
     fast = jnp.maximum(speed_mps / config.speed_limit_mps, 1.0)
     reward = (config.progress * jnp.where(gained > 0.0, gained / fast, gained)
               - config.comfort * terms["discomfort"] - config.speeding * terms["speeding"])
     if "collision" not in terms:
-        return reward
-    likely = jnp.maximum(terms["collision"] - config.tolerated_collision, 0.0) / (1.0 - config.tolerated_collision)
-    return reward - config.collision * likely
+        return unharmed * reward
+    return unharmed * (reward - config.collision * likely(terms["collision"], config))
 
 
 LEARNED_HEADS = ("reward", "continue")

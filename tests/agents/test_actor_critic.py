@@ -9,7 +9,7 @@ import numpy as np
 import worlds
 from worlds import make
 
-from muvo_jax.agents import actor_critic
+from muvo_jax.agents import actor_critic, rewards
 from muvo_jax.agents import environment as environment_lib
 
 
@@ -68,6 +68,17 @@ def test_a_drive_that_is_cut_off_is_bootstrapped_there():
     returns = actor_critic.lambda_returns(reward, jnp.full(3, 0.5), value, 0.9, truncated)
     cut = 2.0 + 0.5 * 20.0
     np.testing.assert_allclose(returns, [1.0 + 0.5 * (0.1 * 10.0 + 0.9 * cut), cut, 4.0 + 0.5 * 30.0])
+
+
+def test_values_are_those_of_an_unharmed_car():
+    config, touched = rewards.RewardConfig(), jnp.array([[0.2, 0.6], [0.9, 0.6], [0.4, 0.6]])
+    chance, unharmed = rewards.likely(touched, config), jnp.cumprod(1.0 - rewards.likely(touched, config), axis=0)
+    earned = rewards.unharmed_before(touched.T, config).T * (0.5 - config.collision * chance)
+    reward, ends = actor_critic._to_an_unharmed_car(earned, jnp.zeros((3, 2), jnp.bool_), unharmed)
+    np.testing.assert_allclose(reward, 0.5 - config.collision * chance, rtol=1e-4)
+    np.testing.assert_allclose(ends, chance, rtol=1e-4, atol=1e-6)
+    _, ends = actor_critic._to_an_unharmed_car(earned, jnp.ones((3, 2), jnp.bool_), unharmed)
+    np.testing.assert_array_equal(ends, 1.0)
 
 
 def test_steps_after_the_end_of_an_episode_teach_nothing():

@@ -246,6 +246,26 @@ def test_the_reward_adds_up_and_ends_at_a_collision():
     assert not terminated
 
 
+def contact(touched, speed=5.0):
+    """Rewards [H] of a car on its route at a speed that touches something at probabilities [H]."""
+    count, touched = len(touched), jnp.asarray(touched, jnp.float32)
+    places = jnp.stack([0.2 * speed * jnp.arange(count + 1.0), *jnp.zeros((2, count + 1))], axis=1)
+    motion = lambda part: motion_ops.Motion(part, jnp.full(count, speed))
+    steps = rewards.Moment(motion(places[:-1]), motion(places[1:]), jnp.zeros((count, 2)), jnp.zeros((3,)), {},
+                           unharmed=rewards.unharmed_before(touched, CONFIG))
+    return np.asarray(rewards.weighed(steps, touched, contract=CONTRACT, step_s=0.2, config=CONFIG)[0])
+
+
+def test_no_slow_contact_costs_more_than_a_crash_and_none_is_free():
+    crash, earned = contact([1.0])[0], lambda *touched: contact(touched).sum()
+    np.testing.assert_allclose(crash, 0.5 - CONFIG.collision, rtol=1e-5)
+    for count in (2, 10, 100):
+        assert crash < earned(*[0.6] * count) < earned(0.6)
+    assert earned(0.6, 0.6, 0.0, 0.0) < earned(0.6, 0.0, 0.0, 0.0) < earned(0.0, 0.0, 0.0, 0.0)
+    # After an hour beside something there is nothing left to gain.
+    np.testing.assert_allclose(contact([0.6] * 40 + [0.0])[-1], 0.0, atol=1e-6)
+
+
 def test_gradients_push_the_car_away_from_obstacles_and_towards_the_route():
     plan = rewards.obstacle_plan(logits([(12, 8, 2)]), GRID, CONFIG.box)  # centre 4.5 m ahead, the bumper at 3.7 m
     touch = lambda pose: rewards.box_collision(plan, pose[None], GRID, CONFIG.box)[0]

@@ -1,5 +1,6 @@
 """Sine positions, keyed dropout and the transformer encoder."""
 
+import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -120,3 +121,26 @@ def test_decoder_dropout_of_a_sample_follows_its_key():
     dropped = decode(variables, x, memory, keys)
     np.testing.assert_allclose(decode(variables, x[::-1], memory[::-1], keys[::-1])[::-1], dropped, atol=1e-5)
     assert not np.allclose(decode(variables, x, memory), dropped, atol=1e-2)
+
+
+@pytest.mark.parametrize("rate", [0.0, 0.3])
+def test_large_weights_are_worked_out_head_by_head_and_mix_the_same(monkeypatch, rate):
+    layer = attention.Attention(2, rate)
+    x, memory = (jax.random.normal(jax.random.key(seed), (3, length, 8)) for seed, length in ((0, 5), (1, 7)))
+    keys = jax.random.split(jax.random.key(2), 3)
+    variables = init.fill(jax.eval_shape(layer.init, jax.random.key(0), x, memory, None, 0), jax.random.key(3))
+
+    def scored(variables, x, memory):
+        y = layer.apply(variables, x, memory, keys, 4)
+        return (y**2).sum(), y
+
+    def everything():
+        results = jax.jit(jax.value_and_grad(scored, argnums=(0, 1, 2), has_aux=True))(variables, x, memory)
+        return results, jax.jvp(lambda x: scored(variables, x, memory)[0], (x,), (jnp.ones_like(x),))
+
+    program = lambda: str(jax.make_jaxpr(lambda *given: scored(*given))(variables, x, memory))
+    assert "scan" not in program()
+    at_once = everything()
+    monkeypatch.setattr(attention, "_LARGE", 0)
+    assert "scan" in program()
+    chex.assert_trees_all_close(everything(), at_once, rtol=1e-5, atol=1e-5)

@@ -211,7 +211,8 @@ def update(environment: environment_lib.Environment, config: ActorCriticConfig, 
     Steps after the end of an episode (params.max_steps_in_episode, if it is less than config.horizon) do not count.
     """
     seen, drawn, transitions = jax.lax.stop_gradient(imagine(environment, config, params, key, learner.actor))
-    reward, ends = _to_an_unharmed_car(transitions.reward, transitions.terminated, transitions.terms.get("unharmed"))
+    unharmed = None if environment.reward_function else transitions.terms.get("unharmed")
+    reward, ends = _to_an_unharmed_car(transitions.reward, transitions.terminated, unharmed)
     drives = lambda actor: (seen, drawn, reward, ends, transitions.truncated)
     return _learn(config, learner, drives, score=1.0)
 

@@ -105,6 +105,11 @@ def test_by_default_a_model_at_even_odds_ends_no_drive():
         jax.random.split(jax.random.key(1), 4), states, ACTION, params)
     np.testing.assert_allclose(transitions.terms["collision"], 0.5, atol=1e-3)
     assert not transitions.terminated.any()
+    first = jax.tree.map(lambda leaf: leaf[0], states)
+    states, transitions = environment_lib.play(environment, params, jax.random.key(1), first, jnp.zeros((9, 2)), 9)
+    assert not transitions.terminated.any()
+    np.testing.assert_allclose(states.unharmed, (1.0 - 0.2 / 0.7) ** np.arange(1, 10), rtol=1e-2)
+    assert transitions.reward.sum() > -20.0, "all contacts together cost no more than a crash"
     with pytest.raises(ValueError, match="holds the road"):
         make(reward_config=rewards.RewardConfig(occupancy_scale=4))
 

@@ -19,7 +19,7 @@ SIZES = {"paper, prior on itself": (1, 1093, 1093, 8, 48), "paper, posterior on 
 
 def ours(query: jax.Array, key: jax.Array, value: jax.Array) -> jax.Array:
     """[N, L, H, c] of [N, L, H, c] and twice [N, M, H, c], as what it is compared with."""
-    heads_first = (jnp.swapaxes(part, 1, 2) for part in (query / query.shape[-1] ** 0.5, key, value))
+    heads_first = (jnp.swapaxes(part, 1, 2) for part in (query, key, value))
     return jnp.swapaxes(attention._attend(0.0, *heads_first, None), 1, 2)
 
 

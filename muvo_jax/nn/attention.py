@@ -115,7 +115,7 @@ class Attention(linen.Module):
         keep = None
         if keys is not None and self.dropout_rate:
             keep = _keep((*query.shape[:-1], key.shape[-2]), keys, site, self.dropout_rate)
-        mixed = _attend(self.dropout_rate, query / math.sqrt(head_channels), key, value, keep)
+        mixed = _attend(self.dropout_rate, query, key, value, keep)
         mixed = jnp.swapaxes(mixed, 1, 2).reshape(count, length, channels)
         return layers.Dense(channels, self.compute, name="out_proj")(mixed)
 
@@ -140,7 +140,7 @@ def _one_by_one(rate: float, query: jax.Array, *others: jax.Array | None) -> jax
 
 def _mixed(rate: float, query: jax.Array, key: jax.Array, value: jax.Array, keep: jax.Array | None) -> jax.Array:
     scores = jnp.einsum("...qc,...kc->...qk", query, key, precision=precision.PRODUCTS,
-                        preferred_element_type=jnp.float32)
+                        preferred_element_type=jnp.float32) / math.sqrt(query.shape[-1])
     weights = jnp.exp(scores - jax.lax.stop_gradient(scores.max(axis=-1, keepdims=True)))
     mixed = jnp.einsum("...qk,...kc->...qc", _kept(weights, keep, rate).astype(value.dtype), value,
                        precision=precision.PRODUCTS, preferred_element_type=jnp.float32)

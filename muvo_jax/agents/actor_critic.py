@@ -27,7 +27,7 @@ from muvo_jax.limits import COUNT, NOT_NEGATIVE, SHARE, above, check
 from muvo_jax.ops import precision
 from muvo_jax.types import Array
 
-_GONE = 1e-3  # a drive that is likelier to have ended counts as one that is as likely to
+_GONE = 1e-3  # where less is left of a drive, what it earns is not divided by so little
 
 
 @dataclasses.dataclass(frozen=True)

@@ -334,7 +334,7 @@ def unharmed_before(touched: Array, config: RewardConfig, at_first: Array | floa
     return jnp.concatenate([jnp.broadcast_to(at_first, (*touched.shape[:-1], 1)), after[..., :-1]], axis=-1)
 
 
-def total(terms: Mapping[str, Array], speed_mps: Array, unharmed: Array | float, *, step_s: float,
+def total(terms: Mapping[str, Array], speed_mps: Array, unharmed: Array | float = 1.0, *, step_s: float,
           config: RewardConfig) -> Array:
     """The driving reward [...] of its terms, as `weighed` says; without the term "collision" nothing is touched.
 

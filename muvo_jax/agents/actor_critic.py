@@ -236,8 +236,8 @@ def improve(environment: environment_lib.Environment, config: ActorCriticConfig,
             drawn = mean + std * noise[step]
             return jnp.tanh(drawn), drawn
 
-        seen, reward, terminated, drawn, unharmed = futures_lib.drive_unharmed(environment, futures, start, act)
-        return seen, drawn, *_to_an_unharmed_car(reward, terminated, unharmed), None
+        seen, reward, ends, drawn = futures_lib.drive_unharmed(environment, futures, start, act)
+        return seen, drawn, reward, ends, None
 
     return _learn(config, learner, drives, score=config.score)
 

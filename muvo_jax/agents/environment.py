@@ -256,7 +256,7 @@ class Environment:
         reward, terminated, terms = self._reward(moment)
         reward = self.caution.believed(reward, state.time + 1)
         after = EnvState(latent, motion, state.start, state.time + 1, reward, terminated,
-                         terms["unharmed"] if self._tests_collisions else state.unharmed)
+                         jnp.asarray(terms.get("unharmed", state.unharmed), jnp.float32))
         truncated = after.time >= params.max_steps_in_episode
         return after, Transition(self._observe(after, params, full, coarse), reward, terminated, truncated, terms), read
 

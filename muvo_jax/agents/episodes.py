@@ -154,8 +154,8 @@ class EnvState:
       time: int32, steps since the start.
       reward: float32, of the step that led here; 0 at the start.
       terminated: bool, at that step; false at the start.
-      unharmed: float32, the probability that the drive has not collided so far; 1 at the start, and where the driving
-        reward does not seek collisions.
+      unharmed: float32, the probability that the drive has not collided so far; 1 at the start, and where the reward's
+        terms do not say it (rewards.weighed).
     """
 
     latent: LatentState

@@ -197,11 +197,11 @@ def look(environment: environment_lib.Environment, here: Around, motion: Motion)
 
 
 def advance(environment: environment_lib.Environment, there: Around, motion: Motion, action: Array, step: Array,
-            unharmed: Array | float) -> tuple[Motion, Array, Array, dict[str, Array]]:
+            unharmed: Array | float | None = None) -> tuple[Motion, Array, Array, dict[str, Array]]:
     """One car drives one step on the bicycle's path, its step-th: Motion, reward, terminated and the reward's terms.
 
     there: around it after the step.
-    unharmed: as EnvState's, before it.
+    unharmed: as EnvState's, before it; None counts as 1.
     """
     config, grid, touched = environment.reward_config, environment.model.config.voxels, None
     after = motion_ops.drive(motion, action, environment.contract, environment.periods)
@@ -233,23 +233,30 @@ def drive(environment: environment_lib.Environment, futures: Futures, start: Mot
       observations [H + 1, N, CHANNELS], rewards [H, N], terminated bool [H, N], and what `act` returned beside the
       actions, [H, N, ...].
     """
-    observed, reward, terminated, extra, _ = drive_unharmed(environment, futures, start, act)
-    return observed, reward, terminated, extra
+    return _drive(environment, futures, start, act, unharmed=False)
 
 
 def drive_unharmed(environment: environment_lib.Environment, futures: Futures, start: Motion, act: Act):
-    """As `drive`, and beside that EnvState's `unharmed` after each step, [H, N]."""
+    """As `drive`, but each step earns what it is worth to a car that came to it unharmed, and instead of `terminated`
+    stands how likely the step ends the drive, float32 [H, N]."""
+    observed, reward, (terminated, unharmed), extra = _drive(environment, futures, start, act, unharmed=True)
+    return observed, reward, jnp.where(terminated, 1.0, 1.0 - unharmed), extra
+
+
+def _drive(environment, futures, start, act, unharmed):
+    """`drive`; with `unharmed` what it returns as terminated is that and how likely a step leaves the car unharmed."""
     surroundings = lambda step: around(environment, futures, slice(None), step)
     observe = lambda motion, step: jax.vmap(functools.partial(look, environment))(surroundings(step), motion)
 
     def step(carry, index):
-        motion, unharmed = carry
+        motion, left = carry
         observation = observe(motion, index)
         action, extra = act(observation, index)
         after, reward, terminated, terms = jax.vmap(functools.partial(advance, environment), (0, 0, 0, None, 0))(
-            surroundings(index + 1), motion, action, index + 1, unharmed)
-        unharmed = terms.get("unharmed", unharmed)
-        return (after, unharmed), (observation, reward, terminated, extra, unharmed)
+            surroundings(index + 1), motion, action, index + 1, left)
+        then = terms.get("unharmed", left)
+        ends = (terminated, then) if unharmed else terminated
+        return (after, left if unharmed else then), (observation, reward, ends, extra)
 
     (last, _), (observed, *driven) = jax.lax.scan(step, (start, jnp.ones_like(start.speed_mps)),
                                                   jnp.arange(futures.horizon))

@@ -213,8 +213,8 @@ def shared_future_returns(environment: environment_lib.Environment, params: envi
         touched = None
         if environment.reward_config.collision:
             touched = _touched(environment, params, jax.random.split(key, 1)[0], state, plans[0], before, after)
-        unharmed = 1.0 if touched is None else rewards.unharmed_before(touched, environment.reward_config,
-                                                                       state.unharmed)
+        unharmed = None if touched is None else rewards.unharmed_before(touched, environment.reward_config,
+                                                                        state.unharmed)
         moment = rewards.Moment(before, after, plans, state.latent.features, {}, route=params.route_of(state),
                                 unharmed=unharmed)
         reward, terminated, _ = rewards.weighed(moment, touched, contract=environment.contract,

@@ -102,7 +102,7 @@ class Moment:
       route: the line that it shows, in the same frame as the motions, or None.
       seen: float32 [..., X, Y], 1 where something stood at the height of the car when the start was observed (see
         `seen_plan`), in the same frame; None where that is unknown.
-      unharmed: float32 [...], the probability that the drive has not collided before the step.
+      unharmed: float32 [...], the probability that the drive has not collided before the step; None counts as 1.
     """
 
     before: Motion
@@ -113,7 +113,7 @@ class Moment:
     route_map: Array | None = None
     route: route_lib.Route | None = None
     seen: Array | None = None
-    unharmed: Array | float = 1.0
+    unharmed: Array | float | None = None
 
 
 def obstacle_plan(occupancy: Array, grid: config_lib.VoxelGrid, box: EgoBox, *, pooled: bool = True) -> Array:
@@ -307,7 +307,8 @@ def weighed(moment: Moment, touched: Array | None, *, contract: config_lib.Actio
              - speeding * speeding); gains above the limit are divided by speed / limit
 
     It is what is to be expected where the drive ends in each step with probability likely(p): all contacts of a drive
-    together cost no more than one certain collision, and after them there is as little to gain.
+    together cost no more than one certain collision, and after them there is as little to gain. A reward function that
+    wraps this one returns its terms, from which the environment knows how unharmed a drive is.
 
     Returns:
       reward [...], terminated bool [...] (p above config.terminal_collision), and the terms by name: among them
@@ -315,16 +316,17 @@ def weighed(moment: Moment, touched: Array | None, *, contract: config_lib.Actio
     """
     terms = {"progress_m": progress_m(moment, config), "discomfort": discomfort(moment, contract, step_s, config),
              "speeding": speeding(moment, config)}
+    unharmed = 1.0 if moment.unharmed is None else moment.unharmed
     if touched is not None:
-        terms |= {"collision": touched, "unharmed": moment.unharmed * (1.0 - likely(touched, config))}
-    reward = total(terms, moment.after.speed_mps, moment.unharmed, step_s=step_s, config=config)
+        terms |= {"collision": touched, "unharmed": unharmed * (1.0 - likely(touched, config))}
+    reward = total(terms, moment.after.speed_mps, unharmed, step_s=step_s, config=config)
     ends = jnp.zeros(reward.shape, jnp.bool_) if touched is None else touched > config.terminal_collision
     return reward, ends, terms
 
 
 def likely(touched: Array, config: RewardConfig) -> Array:
     """How likely a step of collision probability p ends the drive: max(0, p - q) / (1 - q), q what is tolerated."""
-    return jnp.maximum(touched - config.tolerated_collision, 0.0) / (1.0 - config.tolerated_collision)
+    return jnp.clip((touched - config.tolerated_collision) / (1.0 - config.tolerated_collision), 0.0, 1.0)
 
 
 def unharmed_before(touched: Array, config: RewardConfig, at_first: Array | float = 1.0) -> Array:

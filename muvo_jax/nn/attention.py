@@ -133,9 +133,9 @@ def _attend(rate: float, query: jax.Array, key: jax.Array, value: jax.Array, kee
     return jax.lax.platform_dependent(query, key, value, keep, cpu=one_by_one, default=at_once)
 
 
-def _one_by_one(rate: float, query: jax.Array, *others: jax.Array | None) -> jax.Array:
-    flat = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), (query, *others))
-    return jax.lax.map(lambda head: _mixed(rate, *head), flat).reshape(query.shape)
+def _one_by_one(rate: float, *heads: jax.Array | None) -> jax.Array:
+    by_head = jax.tree.map(lambda leaf: jnp.swapaxes(leaf, 0, 1), heads)
+    return jnp.swapaxes(jax.lax.map(lambda head: _mixed(rate, *head), by_head), 0, 1)
 
 
 def _mixed(rate: float, query: jax.Array, key: jax.Array, value: jax.Array, keep: jax.Array | None) -> jax.Array:

@@ -130,6 +130,21 @@ def test_it_learns_to_stop_before_the_wall(imagined):
     assert not ended.any()
 
 
+def test_what_steps_are_worth_to_an_unharmed_car(imagined):
+    world, _, futures = imagined
+    act = lambda seen, step: (jnp.zeros((2, 2)), ())
+    start = Motion(jnp.zeros((2, 3)), futures.speed_mps)
+    _, earned, terminated, _ = futures_lib.drive(world, futures, start, act)
+    _, reward, ends, _ = futures_lib.drive_unharmed(world, futures, start, act)
+    left = jnp.cumprod(1.0 - jnp.where(terminated, 0.0, ends), axis=0)  # a drive goes on past its end here
+    crashed = jnp.argmax(terminated, axis=0)
+    for car in range(2):
+        until = int(crashed[car]) + 1
+        before = jnp.concatenate([jnp.ones(1), left[:until - 1, car]])
+        np.testing.assert_allclose(earned[:until, car], before * reward[:until, car], rtol=1e-4, atol=1e-5)
+    assert terminated.any() and (ends[terminated] == 1.0).all() and (ends >= 0.0).all() and (ends <= 1.0).all()
+
+
 def test_what_cannot_be_shared_is_refused(imagined):
     world, policy, _ = imagined
     features = dataclasses.replace(world, observation="features")

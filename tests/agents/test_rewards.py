@@ -256,6 +256,19 @@ def contact(touched, speed=5.0):
     return np.asarray(rewards.weighed(steps, touched, contract=CONTRACT, step_s=0.2, config=CONFIG)[0])
 
 
+def test_no_step_ends_a_drive_more_than_certainly():
+    for tolerated in np.linspace(0.0, 0.99, 100):
+        config = dataclasses.replace(CONFIG, tolerated_collision=float(tolerated))
+        chances = rewards.likely(jnp.array([0.0, tolerated, 1.0], jnp.float32), config)
+        assert ((chances >= 0.0) & (chances <= 1.0)).all()
+
+
+def test_a_moment_of_old_may_be_mapped():
+    given = jax.tree.map(lambda leaf: jnp.stack([leaf, leaf]), moment(5.0))
+    reward = jax.vmap(lambda one: rewards.weighed(one, None, contract=CONTRACT, step_s=0.2, config=CONFIG)[0])(given)
+    assert reward.shape == (2,)
+
+
 def test_no_slow_contact_costs_more_than_a_crash_and_none_is_free():
     crash, earned = contact([1.0])[0], lambda *touched: contact(touched).sum()
     np.testing.assert_allclose(crash, 0.5 - CONFIG.collision, rtol=1e-5)

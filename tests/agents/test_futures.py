@@ -119,14 +119,20 @@ def test_it_learns_to_stop_before_the_wall(imagined):
     config = actor_critic.ActorCriticConfig(width=16, layers=1, learning_rate=1e-2, clip_norm=1.0)
     learner = actor_critic.init(jax.random.key(0), world, config)
     many = futures[jnp.zeros(8, jnp.int32)]
+
+    def driven(actor):
+        act = lambda seen, step: (jax.vmap(actor_critic.policy(config, actor, sampled=False), (None, 0))(
+            jax.random.key(0), seen), ())
+        return futures_lib.drive(world, many, Motion(jnp.zeros((8, 3)), many.speed_mps), act)[1:3]
+
+    before, _ = driven(learner.actor)
     returns = []
     for key in jax.random.split(jax.random.key(1), 30):
         learner, metrics = actor_critic.improve(world, config, many, key, learner)
         returns.append(float(metrics["reward"]))
-    assert np.mean(returns[-5:]) > np.mean(returns[:3]) + 0.3, "crashing costs 20, once"
-    act = lambda seen, step: (jax.vmap(actor_critic.policy(config, learner.actor, sampled=False), (None, 0))(
-        jax.random.key(0), seen), ())
-    ended = futures_lib.drive(world, many, Motion(jnp.zeros((8, 3)), many.speed_mps), act)[2]
+    assert np.mean(returns[-5:]) > np.mean(returns[:3]) + 0.3, "its drives with noise, a step"
+    earned, ended = driven(learner.actor)
+    assert (earned.sum(axis=0) > before.sum(axis=0) + 15.0).all(), "crashing costs 20, once"
     assert not ended.any()
 
 

@@ -233,18 +233,20 @@ def drive(environment: environment_lib.Environment, futures: Futures, start: Mot
       observations [H + 1, N, CHANNELS], rewards [H, N], terminated bool [H, N], and what `act` returned beside the
       actions, [H, N, ...].
     """
-    return _drive(environment, futures, start, act, unharmed=False)
+    observed, reward, terminated, _, extra = _drive(environment, futures, start, act, weighed=True)
+    return observed, reward, terminated, extra
 
 
 def drive_unharmed(environment: environment_lib.Environment, futures: Futures, start: Motion, act: Act):
     """As `drive`, but each step earns what it is worth to a car that came to it unharmed, and instead of `terminated`
     stands how likely the step ends the drive, float32 [H, N]."""
-    observed, reward, (terminated, unharmed), extra = _drive(environment, futures, start, act, unharmed=True)
+    observed, reward, terminated, unharmed, extra = _drive(environment, futures, start, act, weighed=False)
     return observed, reward, jnp.where(terminated, 1.0, 1.0 - unharmed), extra
 
 
-def _drive(environment, futures, start, act, unharmed):
-    """`drive`; with `unharmed` what it returns as terminated is that and how likely a step leaves the car unharmed."""
+def _drive(environment, futures, start, act, weighed):
+    """As `drive`; after `terminated` EnvState's `unharmed` after each step, of a car that is unharmed before each step
+    unless steps are `weighed` by those before them."""
     surroundings = lambda step: around(environment, futures, slice(None), step)
     observe = lambda motion, step: jax.vmap(functools.partial(look, environment))(surroundings(step), motion)
 
@@ -254,9 +256,8 @@ def _drive(environment, futures, start, act, unharmed):
         action, extra = act(observation, index)
         after, reward, terminated, terms = jax.vmap(functools.partial(advance, environment), (0, 0, 0, None, 0))(
             surroundings(index + 1), motion, action, index + 1, left)
-        then = terms.get("unharmed", left)
-        ends = (terminated, then) if unharmed else terminated
-        return (after, left if unharmed else then), (observation, reward, ends, extra)
+        unharmed = terms.get("unharmed", left)
+        return (after, unharmed if weighed else left), (observation, reward, terminated, unharmed, extra)
 
     (last, _), (observed, *driven) = jax.lax.scan(step, (start, jnp.ones_like(start.speed_mps)),
                                                   jnp.arange(futures.horizon))

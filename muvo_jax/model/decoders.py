@@ -19,7 +19,6 @@ from muvo_jax import head as head_lib
 from muvo_jax.config import ModelConfig, TokenLatent, ZeroGuess
 from muvo_jax.model import memory, tokens
 from muvo_jax.nn import layers, norm
-from muvo_jax.ops import resample
 
 _PLANE_KERNELS = (5, 5, 6, 6, 6, 6)
 INSTANCE_CHANNELS = 3  # offset and centre
@@ -89,15 +88,16 @@ class BirdsEyeHead(linen.Module):
 
 
 class StyledConv(linen.Module):
-    """3x3x3 (3x3) convolution, leaky ReLU 0.2, adaptive instance norm."""
+    """3x3x3 (3x3) convolution, of x or of x doubled linearly; leaky ReLU 0.2, adaptive instance norm."""
 
     features: int
     compute: layers.Compute = layers.Compute()
+    doubled: bool = False
 
     @linen.compact
     def __call__(self, x: jax.Array, style: jax.Array) -> jax.Array:
-        x = jax.nn.leaky_relu(layers.Conv(self.features, (3,) * (x.ndim - 2), self.compute, name="conv")(x), 0.2)
-        return norm.AdaptiveInstanceNorm(self.compute, name="norm")(x, style)
+        conv = layers.Conv(self.features, (3,) * (x.ndim - 2), self.compute, doubled=self.doubled, name="conv")
+        return norm.AdaptiveInstanceNorm(self.compute, name="norm")(jax.nn.leaky_relu(conv(x), 0.2), style)
 
 
 class StyledUpBlock(linen.Module):
@@ -108,8 +108,7 @@ class StyledUpBlock(linen.Module):
 
     @linen.compact
     def __call__(self, x: jax.Array, style: jax.Array) -> jax.Array:
-        x = resample.upsample_linear(x, factor=2)
-        x = StyledConv(self.features, self.compute, name="conv1")(x, style)
+        x = StyledConv(self.features, self.compute, doubled=True, name="conv1")(x, style)
         return StyledConv(self.features, self.compute, name="conv2")(x, style)
 
 

@@ -18,7 +18,7 @@ from flax import linen
 
 from muvo_jax.config import ModelConfig
 from muvo_jax.ops import conv as conv_ops
-from muvo_jax.ops import precision
+from muvo_jax.ops import conv_doubled, precision
 
 
 @dataclasses.dataclass(frozen=True)
@@ -82,20 +82,28 @@ class Dense(linen.Module):
 
 
 class Conv(linen.Module):
-    """Correlation with a kernel [*K, I, features]: [N, *S, I] -> [N, *S', features]."""
+    """Correlation with a kernel [*K, I, features]: [N, *S, I] -> [N, *S', features].
+
+    Attributes:
+      doubled: correlate x enlarged linearly to twice its size, in steps of one voxel; kernels have 3 taps an axis.
+    """
 
     features: int
     kernel_size: tuple[int, ...]
     compute: Compute = Compute()
     stride: int = 1
     use_bias: bool = True
+    doubled: bool = False
 
     @linen.compact
     def __call__(self, x: jax.Array) -> jax.Array:
         kernel = self.param("kernel", shape_only, (*self.kernel_size, x.shape[-1], self.features))
-        padding = tuple(size // 2 for size in self.kernel_size)
-        y = conv_ops.conv(x.astype(self.compute.dtype), kernel.astype(self.compute.dtype), stride=self.stride,
-                          padding=padding, implementation=self.compute.convolution)
+        x, kernel = x.astype(self.compute.dtype), kernel.astype(self.compute.dtype)
+        if self.doubled:
+            y = conv_doubled.conv_doubled(x, kernel, implementation=self.compute.convolution)
+        else:
+            y = conv_ops.conv(x, kernel, stride=self.stride, padding=tuple(size // 2 for size in self.kernel_size),
+                              implementation=self.compute.convolution)
         if self.use_bias:
             bias = self.param("bias", shape_only, (self.features,))
             y = y + per_channel(bias.astype(y.dtype), y.ndim)

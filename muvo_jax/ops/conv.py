@@ -42,7 +42,7 @@ def conv(x, kernel, *, stride: PerAxis = 1, padding: PerAxis = 0, implementation
     Raises:
       ValueError: for ranks, channels, dtypes, strides or sizes that do not fit.
     """
-    rank = _check(x, kernel, implementation)
+    rank = check(x, kernel, implementation)
     strides, pads = _per_axis("stride", stride, rank, 1), _per_axis("padding", padding, rank, 0)
     taps = kernel.shape[:rank]
     if any(n + 2 * p < k for n, p, k in zip(x.shape[1:-1], pads, taps, strict=True)):
@@ -52,7 +52,7 @@ def conv(x, kernel, *, stride: PerAxis = 1, padding: PerAxis = 0, implementation
         return conv_cpu.plain(x, kernel, strides, pairs)
     if math.prod(taps) == 1:
         return _pointwise(x, kernel, strides, pairs)
-    return _formed(implementation, *_conv_forms(strides, pairs), x, kernel)
+    return formed(implementation, *_conv_forms(strides, pairs), x, kernel)
 
 
 def depthwise_conv(x, kernel, *, stride: int = 1, padding: int = 0, implementation: Implementation = "auto"):
@@ -75,7 +75,7 @@ def depthwise_conv(x, kernel, *, stride: int = 1, padding: int = 0, implementati
         raise ValueError(f"depthwise_conv: got x {x.dtype}{list(x.shape)} and kernel {kernel.dtype}"
                          f"{list(kernel.shape)}, expected [N, H, W, C] and [K, K, 1, C] of one dtype.")
     shifted, grouped = _depthwise_forms(stride, padding)
-    return grouped(x, kernel) if implementation == "xla" else _formed(implementation, shifted, grouped, x, kernel)
+    return grouped(x, kernel) if implementation == "xla" else formed(implementation, shifted, grouped, x, kernel)
 
 
 def conv_transpose(x, kernel, *, stride: PerAxis = 1, padding: PerAxis = 0, output_padding: PerAxis = 0,
@@ -97,7 +97,7 @@ def conv_transpose(x, kernel, *, stride: PerAxis = 1, padding: PerAxis = 0, outp
     Raises:
       ValueError: for ranks, channels, dtypes, strides or sizes that do not fit.
     """
-    rank = _check(x, kernel, implementation)
+    rank = check(x, kernel, implementation)
     strides, pads = _per_axis("stride", stride, rank, 1), _per_axis("padding", padding, rank, 0)
     extra = _per_axis("output_padding", output_padding, rank, 0)
     taps = kernel.shape[:rank]
@@ -150,7 +150,12 @@ def max_pool(x, *, window: PerAxis, stride: PerAxis, padding: PerAxis = 0):
     return x
 
 
-def _check(x, kernel, implementation) -> int:
+def check(x, kernel, implementation) -> int:
+    """The number of spatial axes of x [N, *S, C] and kernel [*K, C, O].
+
+    Raises:
+      ValueError: where they do not fit each other, or for an unknown implementation.
+    """
     rank = kernel.ndim - 2
     if implementation not in ("auto", "xla", "gemm"):
         raise ValueError(f"implementation: got {implementation!r}, expected 'auto', 'xla' or 'gemm'.")
@@ -179,7 +184,8 @@ def reverse_only(implementation: str) -> bool:
 Form = Callable[[jax.Array, jax.Array], jax.Array]  # (x, kernel) -> result
 
 
-def _formed(implementation: str, cpu: Form, other: Form, x, kernel):
+def formed(implementation: str, cpu: Form, other: Form, x, kernel):
+    """One form of a computation on a CPU, or wherever "gemm" is asked for, and another elsewhere."""
     return cpu(x, kernel) if implementation == "gemm" else _by_platform(cpu, other, x, kernel)
 
 
@@ -280,7 +286,7 @@ def _phases(x, kernel, strides, pads, outs, implementation):
     kernel = kernel.reshape(*reads, channels_in, math.prod(strides) * channels_out)
     pairs = tuple((q - 1 - f, e - (n - 1))
                   for q, f, e, n in zip(reads, first, last, x.shape[1:-1], strict=True))
-    dense = _formed(implementation, *_conv_forms((1,) * rank, pairs), x, kernel)
+    dense = formed(implementation, *_conv_forms((1,) * rank, pairs), x, kernel)
     full = conv_cpu.depth_to_space(dense, strides)
     starts = [p - f * s for p, f, s in zip(pads, first, strides, strict=True)]
     return lax.slice(full, (0, *starts, 0), (full.shape[0], *(a + o for a, o in zip(starts, outs, strict=True)),

@@ -2,10 +2,10 @@
 
 XLA's CPU backend runs a 2D convolution at the speed of a matrix product, but the gradient with respect to the kernel is
 a convolution whose window is the whole image, and 3D convolutions with few channels are about ten times slower than
-need be. Here the kernel gradient is one matrix product per kernel tap, accumulated over chunks that stay in the cache
-(or XLA's own, where a large batch of narrow images makes that one fast); the input gradient is an ordinary convolution
-with the flipped kernel; and a 3D convolution folds blocks of voxels along its last axis into channels, so that a banded
-kernel and a 2D convolution do the work. A layer of a few pixels and many channels is one matrix product.
+need be. Here the kernel gradient is a matrix product with the shifted copies of all taps, accumulated over chunks that
+stay in the cache (or XLA's own, where there is little to do); the input gradient is an ordinary convolution with the
+flipped kernel; and a 3D convolution folds blocks of voxels along its last axis into channels, so that a banded kernel
+and a 2D convolution do the work. A layer of a few pixels and many channels is one matrix product.
 
 `muvo_jax.ops.conv` is the public face; nothing here checks its arguments. Reverse-mode differentiation only.
 """
@@ -25,13 +25,14 @@ from muvo_jax.ops import precision
 
 Pairs = tuple[tuple[int, int], ...]
 
-_CHUNK_BYTES = 1 << 20  # what one pass over the kernel taps reads: half of a core's second-level cache
+_CHUNK_BYTES = 1 << 22  # what one product reads, the shifted copies included; half and twice as much are slower
 _LITTLE_WORK = 5e8  # floating-point operations of a kernel gradient below which XLA's own one is at least as fast
 # A layer of so few pixels a sample and so many weights a tap is faster as a matrix product: 17 times at one pixel of
 # 512 channels, with gradients (experiments/speed/convolutions.md); at 64 pixels of 128 channels it no longer is.
 _FEW_PIXELS = 8
 _MANY_WEIGHTS = 1 << 14
 _FOLDED_WIDTH = 16  # output channels of a folded block below which the matrix product starves
+_WIDE_ENOUGH = 64  # output channels that need no block: what a band multiplies by zero is saved
 
 
 def plain(x, kernel, stride: tuple[int, ...], padding: Pairs, kernel_dilation: tuple[int, ...] | None = None):
@@ -53,11 +54,9 @@ def dilated(x, kernel, stride: Sequence[int], padding: Sequence[int], outs: Sequ
                                     precision=precision.PRODUCTS)
 
 
-def _xla_gradient_is_fast(x, kernel, gradient) -> bool:
-    """Whether XLA's own kernel gradient beats ours (measured: little work, or narrow and a batch to vectorise over)."""
-    channels_in, channels_out = kernel.shape[-2:]
-    operations = 2 * gradient.size // channels_out * kernel.size
-    return operations < _LITTLE_WORK or (x.shape[0] >= 8 and channels_in * channels_out <= 1024)
+def _xla_gradient_is_fast(kernel, gradient) -> bool:
+    """Whether XLA's own kernel gradient beats ours (measured: where there is little to do)."""
+    return 2 * gradient.size // kernel.shape[-1] * kernel.size < _LITTLE_WORK
 
 
 def dense(x, kernel, padding: Pairs):
@@ -121,7 +120,7 @@ def _dense_2d_backward(padding, dilation, residuals, gradient):
     reach = [(taps - 1) * step for taps, step in zip(kernel.shape[:2], dilation, strict=True)]
     x_padding = tuple((r - low, r - high) for r, (low, high) in zip(reach, padding, strict=True))
     x_gradient = plain(gradient, flipped, (1, 1), x_padding, dilation)
-    if _xla_gradient_is_fast(x, kernel, gradient):
+    if _xla_gradient_is_fast(kernel, gradient):
         return x_gradient, _whole_kernel_gradient(x, gradient, kernel.shape[:2], (1, 1), padding, dilation)
     edges = ((0, 0, 0), *((low, high, 0) for low, high in padding), (0, 0, 0))
     padded = lax.pad(x, jnp.zeros((), x.dtype), edges)
@@ -151,34 +150,41 @@ def _whole_kernel_gradient(x, gradient, taps: tuple[int, ...], stride: tuple[int
 def _kernel_gradient(x, gradient, taps: tuple[int, int], dilation: tuple[int, int]):
     """sum over n, i of x[n, i + tap * dilation]^T gradient[n, i], float32 [*taps, C, O]; x is already padded.
 
-    A chunk is some whole samples or some rows of one sample: small enough that the shifted copies stay in the cache.
+    The side with fewer channels is what is shifted: its copies for all taps, side by side, make a wide product of what
+    would be narrow ones (twice as fast for 8 to 16 channels).
     """
-    batch, _, x_columns, channels_in = x.shape
-    _, rows, columns, channels_out = gradient.shape
-    row_bytes = (x_columns * channels_in + columns * channels_out) * x.dtype.itemsize
-    samples, chunk_rows = _chunk(batch, rows, row_bytes)
+    if x.shape[-1] <= gradient.shape[-1]:
+        return _correlation(gradient, x, taps, dilation).swapaxes(2, 3)
+    edges = [((k - 1) * d, (k - 1) * d, 0) for k, d in zip(taps, dilation, strict=True)]
+    gradient = lax.pad(gradient, jnp.zeros((), gradient.dtype), ((0, 0, 0), *edges, (0, 0, 0)))
+    return _correlation(x, gradient, taps, dilation)[::-1, ::-1]
+
+
+def _correlation(still, shifted, taps: tuple[int, int], dilation: tuple[int, int]):
+    """sum over n, i of still[n, i]^T shifted[n, i + tap * dilation], at least float32 [*taps, A, B].
+
+    A chunk is some whole samples or some rows of one sample.
+    """
+    batch, rows, columns, channels = still.shape
+    width = math.prod(taps) * shifted.shape[-1]
+    samples, chunk_rows = _chunk(batch, rows, columns * (channels + width) * still.dtype.itemsize)
     row_chunks = -(-rows // chunk_rows)
-    missing = row_chunks * chunk_rows - rows
-    if missing:
-        x, gradient = (jnp.pad(a, ((0, 0), (0, missing), (0, 0), (0, 0))) for a in (x, gradient))
-    contract = (((0, 1, 2), (0, 1, 2)), ((), ()))
+    missing = ((0, 0), (0, row_chunks * chunk_rows - rows), (0, 0), (0, 0))
+    still, shifted = (jnp.pad(a, missing) for a in (still, shifted))
+    reach = [(k - 1) * d for k, d in zip(taps, dilation, strict=True)]
 
     def add_chunk(total, chunk):
-        sample, row = (chunk // row_chunks) * samples, (chunk % row_chunks) * chunk_rows
-        outer = lax.dynamic_slice(gradient, (sample, row, 0, 0), (samples, chunk_rows, columns, channels_out))
+        start = (chunk // row_chunks) * samples, (chunk % row_chunks) * chunk_rows, 0, 0
+        inner = lax.dynamic_slice(still, start, (samples, chunk_rows, columns, channels))
+        outer = lax.dynamic_slice(shifted, start, (samples, chunk_rows + reach[0], *shifted.shape[2:]))
+        copies = [outer[:, row:row + chunk_rows, column:column + columns]
+                  for row in range(0, reach[0] + 1, dilation[0]) for column in range(0, reach[1] + 1, dilation[1])]
+        return total + lax.dot_general(inner, jnp.concatenate(copies, axis=-1), (((0, 1, 2), (0, 1, 2)), ((), ())),
+                                       precision=precision.PRODUCTS, preferred_element_type=total.dtype), None
 
-        def product(tap):
-            start = (sample, row + (tap // taps[1]) * dilation[0], (tap % taps[1]) * dilation[1], 0)
-            inner = lax.dynamic_slice(x, start, (samples, chunk_rows, columns, channels_in))
-            return lax.dot_general(inner, outer, contract, precision=precision.PRODUCTS,
-                                   preferred_element_type=total.dtype)
-
-        return total + lax.map(product, jnp.arange(math.prod(taps))), None
-
-    dtype = jnp.promote_types(x.dtype, jnp.float32)
-    zeros = jnp.zeros((math.prod(taps), channels_in, channels_out), dtype)
+    zeros = jnp.zeros((channels, width), jnp.promote_types(still.dtype, jnp.float32))
     total, _ = lax.scan(add_chunk, zeros, jnp.arange(batch // samples * row_chunks))
-    return total.reshape(*taps, channels_in, channels_out)
+    return total.reshape(channels, *taps, -1).transpose(1, 2, 0, 3)
 
 
 def _chunk(batch: int, rows: int, row_bytes: int) -> tuple[int, int]:
@@ -236,7 +242,7 @@ def _folded_by_2d(x, kernel, padding: Pairs):
 
 def _block(z_out: int, channels_out: int) -> int:
     """Voxels per block: enough output channels for a matrix product, all of a short axis (then nothing is copied)."""
-    block = max(2, _FOLDED_WIDTH // channels_out)
+    block = 1 if channels_out >= _WIDE_ENOUGH else max(2, _FOLDED_WIDTH // channels_out)
     return z_out if z_out <= max(4, block) else block
 
 
@@ -272,7 +278,7 @@ def _strided_2d_forward(x, kernel, stride, padding):
 
 def _strided_2d_backward(stride, padding, residuals, gradient):
     x, kernel = residuals
-    if not _xla_gradient_is_fast(x, kernel, gradient):
+    if not _xla_gradient_is_fast(kernel, gradient):
         _, pull_back = jax.vjp(functools.partial(_strided_by_phases, stride=stride, padding=padding), x, kernel)
         return pull_back(gradient)
     x_gradient = dilated(gradient, kernel.swapaxes(2, 3), stride, [low for low, _ in padding], x.shape[1:3])

@@ -13,7 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from muvo_jax.ops import conv as conv_ops
-from muvo_jax.ops import conv_cpu
+from muvo_jax.ops import conv_cpu, conv_doubled, resample
 
 PROPERTY = settings(max_examples=10, deadline=None, derandomize=True)
 
@@ -149,11 +149,35 @@ def test_folded_voxels_of_any_height(z_size, channels_out, strict_dtypes):
     assert_same_function(functools.partial(conv_ops.conv, padding=1), x, kernel)
 
 
+@PROPERTY
+@given(st.lists(st.integers(1, 5), min_size=2, max_size=3), st.integers(1, 3), st.sampled_from([1, 5, 16, 17]))
+def test_convolving_what_was_doubled_without_doubling_it(sizes, channels_in, channels_out):
+    """Down to a single voxel, all of whose neighbours lie beyond the border."""
+    x, kernel = normal(0, (2, *sizes, channels_in), (*(3,) * len(sizes), channels_in, channels_out))
+    with jax.numpy_dtype_promotion("strict"):
+        got = assert_same_function(conv_doubled.conv_doubled, x, kernel)
+    doubled = np.asarray(resample.upsample_linear(x))
+    assert_near(got, conv_by_definition(doubled, np.asarray(kernel), (1,) * len(sizes), (1,) * len(sizes)))
+
+
+def test_convolving_what_was_doubled_takes_three_taps_an_axis():
+    x, kernel = normal(0, (1, 4, 4, 4, 2), (3, 3, 5, 2, 2))
+    with pytest.raises(ValueError, match="expected \\[3, 3, C, O\\]"):
+        conv_doubled.conv_doubled(x, kernel)
+
+
+@pytest.mark.parametrize("channels_out", [63, 64])
+def test_folded_voxels_of_many_channels(channels_out, strict_dtypes):
+    x, kernel = normal(0, (1, 3, 4, 6, 2), (3, 3, 3, 2, channels_out))
+    assert_same_function(functools.partial(conv_ops.conv, padding=1), x, kernel)
+
+
 @pytest.mark.parametrize("chunk_bytes", [1, 600, 3000, 10**6])
 def test_kernel_gradient_does_not_depend_on_the_chunks(chunk_bytes, monkeypatch, strict_dtypes):
     monkeypatch.setattr(conv_cpu, "_CHUNK_BYTES", chunk_bytes)
-    x, kernel = normal(0, (6, 7, 5, 3), (3, 2, 3, 4))
-    assert_same_function(functools.partial(conv_ops.conv, padding=(1, 0)), x, kernel)
+    for channels in ((3, 4), (4, 3)):  # the side with fewer is the one that is shifted
+        x, kernel = normal(0, (6, 7, 5, channels[0]), (3, 2, *channels))
+        assert_same_function(functools.partial(conv_ops.conv, padding=(1, 0)), x, kernel)
 
 
 @pytest.mark.parametrize(("size", "taps", "stride"), [((9, 8), 3, 1), ((9, 8), 3, 2), ((12, 7), 7, 2), ((8, 8), 6, 3)])
@@ -177,9 +201,12 @@ def test_gradients_inside_a_loop_are_of_the_form_that_is_fast_there(size, taps, 
     functools.partial(conv_ops.conv, padding=1),
     functools.partial(conv_ops.conv, padding=1, stride=2),
     functools.partial(conv_ops.conv_transpose, padding=1, stride=2),
+    conv_doubled.conv_doubled,
 ])
 def test_bfloat16_accumulates_in_float32(function):
     x, kernel = normal(0, (2, 24, 24, 4), (3, 3, 4, 4), dtype=jnp.bfloat16)
+    if function is conv_doubled.conv_doubled:
+        x, kernel = normal(0, (2, 12, 8, 6, 4), (3, 3, 3, 4, 4), dtype=jnp.bfloat16)
     exact = functools.partial(function, implementation="xla")
     fast = functools.partial(function, implementation="gemm")
     gradients = lambda f: jax.jit(jax.grad(lambda x, kernel: f(x, kernel).astype(jnp.float32).sum(), (0, 1)))

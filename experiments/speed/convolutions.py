@@ -19,6 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from muvo_jax.ops import conv as conv_ops
+from muvo_jax.ops import conv_doubled
 
 
 @dataclasses.dataclass(frozen=True)
@@ -49,6 +50,8 @@ def layers(batch: int, height: int, width: int) -> list[Layer]:
               (batch, 4 * height, 4 * width, 3), (7, 7, 3, 64)),
         Layer("3x3x3, 16 -> 8", functools.partial(conv, padding=1),
               (batch, 2 * side, 2 * side, 2 * depth, 16), (3, 3, 3, 16, 8)),
+        Layer("3x3x3 of what is doubled, 16 -> 8", functools.partial(conv_doubled.conv_doubled),
+              (batch, side, side, depth, 16), (3, 3, 3, 16, 8)),
         Layer("3x3x3, 64 -> 64", functools.partial(conv, padding=1),
               (batch, side, side, depth, 64), (3, 3, 3, 64, 64)),
         Layer("3x3, 512 -> 512, of one pixel", functools.partial(conv, padding=1),

@@ -296,8 +296,9 @@ def perceptual_distances(context: cases.Context) -> Checks:
             return _feature_distance(features, wanted, jnp.abs if norm == "l1" else jnp.square, style)
 
         differentiate = jax.jit(jax.value_and_grad(distance))
+        # Several kinks must fall to the reference's sides at once: of the L1 in one of 32 roundings (160 tried).
         again = lambda differentiate=differentiate: (differentiate(prediction, moved)[1]
-                                                     for moved in rounding.anew(weights))
+                                                     for moved in rounding.anew(weights, tries=256))
         value, slope = differentiate(prediction, weights)
         yield cases.Check(f"perceptual_{name}/loss", value, PERCEPTUAL_TOLERANCES[0])
         yield cases.Check(f"perceptual_{name}/grad", slope, PERCEPTUAL_TOLERANCES[1], again=again)

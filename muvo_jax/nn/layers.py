@@ -85,7 +85,7 @@ class Conv(linen.Module):
     """Correlation with a kernel [*K, I, features]: [N, *S, I] -> [N, *S', features].
 
     Attributes:
-      doubled: correlate x enlarged linearly to twice its size, in steps of one voxel; kernels have 3 taps an axis.
+      doubled: correlate x enlarged linearly to twice its size; kernels have 3 taps an axis, the stride is 1.
     """
 
     features: int
@@ -100,6 +100,8 @@ class Conv(linen.Module):
         kernel = self.param("kernel", shape_only, (*self.kernel_size, x.shape[-1], self.features))
         x, kernel = x.astype(self.compute.dtype), kernel.astype(self.compute.dtype)
         if self.doubled:
+            if self.stride != 1:
+                raise ValueError(f"Conv: doubled with a stride of {self.stride}; expected 1.")
             y = conv_doubled.conv_doubled(x, kernel, implementation=self.compute.convolution)
         else:
             y = conv_ops.conv(x, kernel, stride=self.stride, padding=tuple(size // 2 for size in self.kernel_size),

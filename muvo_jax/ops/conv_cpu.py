@@ -32,7 +32,9 @@ _LITTLE_WORK = 5e8  # floating-point operations of a kernel gradient below which
 _FEW_PIXELS = 8
 _MANY_WEIGHTS = 1 << 14
 _FOLDED_WIDTH = 16  # output channels of a folded block below which the matrix product starves
-_WIDE_ENOUGH = 64  # output channels that need no block: what a band multiplies by zero is saved
+# Output channels that need no block: what a band multiplies by zero is saved, for a copy of x of three times its size
+# instead of twice.
+_WIDE_ENOUGH = 64
 
 
 def plain(x, kernel, stride: tuple[int, ...], padding: Pairs, kernel_dilation: tuple[int, ...] | None = None):
@@ -163,7 +165,7 @@ def _kernel_gradient(x, gradient, taps: tuple[int, int], dilation: tuple[int, in
 def _correlation(still, shifted, taps: tuple[int, int], dilation: tuple[int, int]):
     """sum over n, i of still[n, i]^T shifted[n, i + tap * dilation], at least float32 [*taps, A, B].
 
-    A chunk is some whole samples or some rows of one sample.
+    A chunk is some whole samples or some rows of one sample, at least one row.
     """
     batch, rows, columns, channels = still.shape
     width = math.prod(taps) * shifted.shape[-1]
@@ -182,7 +184,7 @@ def _correlation(still, shifted, taps: tuple[int, int], dilation: tuple[int, int
         return total + lax.dot_general(inner, jnp.concatenate(copies, axis=-1), (((0, 1, 2), (0, 1, 2)), ((), ())),
                                        precision=precision.PRODUCTS, preferred_element_type=total.dtype), None
 
-    zeros = jnp.zeros((channels, width), jnp.promote_types(still.dtype, jnp.float32))
+    zeros = jnp.zeros((channels, width), still.dtype if still.dtype.itemsize > 4 else jnp.float32)
     total, _ = lax.scan(add_chunk, zeros, jnp.arange(batch // samples * row_chunks))
     return total.reshape(channels, *taps, -1).transpose(1, 2, 0, 3)
 

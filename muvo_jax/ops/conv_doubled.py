@@ -1,4 +1,4 @@
-"""A convolution of what was doubled linearly; of volumes with few channels, on a CPU, without the doubled volume.
+"""A convolution of what was doubled linearly; of volumes to few channels, on a CPU, without the doubled volume.
 
 Of the eight voxels that a coarse one becomes, each reads a blend of the coarse one and its neighbours, so the doubling
 and the convolution together are one convolution of the coarse volume to eight times the channels: wide products, and
@@ -14,8 +14,8 @@ from jax import lax
 
 from muvo_jax.ops import conv, conv_cpu, precision, resample
 
-# Output channels up to which it pays (measured at 192x192x64 voxels with 8 to 24x24x8 with 64): more make the kernel of
-# eight times as many the larger part of the work.
+# Output channels up to which it pays (measured from 8 at 192x192x64 voxels, 16 at half the sides, to 64 at 24x24x8):
+# with more, the kernel to eight times as many becomes the larger part of the work.
 _FEW_CHANNELS = 16
 # [phase, tap, neighbour]: fine voxel 2 j + phase sees, under each tap, so much of coarse voxels j - 1, j and j + 1.
 _BLEND = np.array([[[0.75, 0.25, 0.0], [0.25, 0.75, 0.0], [0.0, 0.75, 0.25]],

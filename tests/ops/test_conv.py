@@ -217,6 +217,11 @@ def test_bfloat16_accumulates_in_float32(function):
         assert_near(rounded, unrounded, 1e-2)  # one rounding to 8 bits, not 1152 of them
 
 
+def test_kernel_gradients_of_bfloat16_under_strict_promotion(strict_dtypes):
+    x, kernel = normal(0, (2, 6, 5, 4), (3, 3, 4, 2), dtype=jnp.bfloat16)
+    assert_same_function(functools.partial(conv_ops.conv, padding=1), x, kernel, tolerance=2e-2)
+
+
 def test_vmap_scan_remat_and_jit(strict_dtypes):
     x, kernel = normal(0, (3, 2, 5, 5, 4, 2), (3, 3, 3, 2, 2))
     layer = functools.partial(conv_ops.conv, kernel=kernel, padding=1, implementation="gemm")

@@ -2,8 +2,8 @@
 
 XLA's CPU backend runs a 2D convolution at the speed of a matrix product, but the gradient with respect to the kernel is
 a convolution whose window is the whole image, and 3D convolutions with few channels are about ten times slower than
-need be. Here the kernel gradient is a matrix product with the shifted copies of all taps, accumulated over chunks that
-stay in the cache (or XLA's own, where there is little to do); the input gradient is an ordinary convolution with the
+need be. Here the kernel gradient is a matrix product with the shifted copies of all taps, accumulated over chunks of a
+few megabytes (or XLA's own, where there is little to do); the input gradient is an ordinary convolution with the
 flipped kernel; and a 3D convolution folds blocks of voxels along its last axis into channels, so that a banded kernel
 and a 2D convolution do the work. A layer of a few pixels and many channels is one matrix product.
 
@@ -25,7 +25,7 @@ from muvo_jax.ops import precision
 
 Pairs = tuple[tuple[int, int], ...]
 
-_CHUNK_BYTES = 1 << 22  # what one product reads, the shifted copies included; half and twice as much are slower
+_CHUNK_BYTES = 1 << 22  # what one product reads, the shifted copies included: the best of 1 to 8 MiB for most layers
 _LITTLE_WORK = 5e8  # floating-point operations of a kernel gradient below which XLA's own one is at least as fast
 # A layer of so few pixels a sample and so many weights a tap is faster as a matrix product: 17 times at one pixel of
 # 512 channels, with gradients (experiments/speed/convolutions.md); at 64 pixels of 128 channels it no longer is.

@@ -197,16 +197,14 @@ def test_gradients_inside_a_loop_are_of_the_form_that_is_fast_there(size, taps, 
         assert re.findall(r"spec=\(([0-9, ]+)\)", order) == ["0, 3, 1, 2", "3, 2, 0, 1", "0, 3, 1, 2"]
 
 
-@pytest.mark.parametrize("function", [
-    functools.partial(conv_ops.conv, padding=1),
-    functools.partial(conv_ops.conv, padding=1, stride=2),
-    functools.partial(conv_ops.conv_transpose, padding=1, stride=2),
-    conv_doubled.conv_doubled,
+@pytest.mark.parametrize(("function", "sizes"), [
+    (functools.partial(conv_ops.conv, padding=1), (24, 24)),
+    (functools.partial(conv_ops.conv, padding=1, stride=2), (24, 24)),
+    (functools.partial(conv_ops.conv_transpose, padding=1, stride=2), (24, 24)),
+    (conv_doubled.conv_doubled, (12, 8, 6)),
 ])
-def test_bfloat16_accumulates_in_float32(function):
-    x, kernel = normal(0, (2, 24, 24, 4), (3, 3, 4, 4), dtype=jnp.bfloat16)
-    if function is conv_doubled.conv_doubled:
-        x, kernel = normal(0, (2, 12, 8, 6, 4), (3, 3, 3, 4, 4), dtype=jnp.bfloat16)
+def test_bfloat16_accumulates_in_float32(function, sizes):
+    x, kernel = normal(0, (2, *sizes, 4), (*(3,) * len(sizes), 4, 4), dtype=jnp.bfloat16)
     exact = functools.partial(function, implementation="xla")
     fast = functools.partial(function, implementation="gemm")
     gradients = lambda f: jax.jit(jax.grad(lambda x, kernel: f(x, kernel).astype(jnp.float32).sum(), (0, 1)))

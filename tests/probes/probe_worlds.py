@@ -63,8 +63,7 @@ class Bar:
         return config_lib.RangeViewLidar() if memory else None  # nothing is moved without ranges
 
     def steps(self, memory):
-        del memory
-        return STEPS
+        return STEPS if memory else STEPS + STEPS // 2
 
     def starts(self, generator, count):
         return generator.uniform(10.0, SIDE_PX - 10.0, count)
@@ -111,7 +110,7 @@ class Wall:
         return config_lib.RangeViewLidar()
 
     def steps(self, memory):
-        return STEPS if memory else 4 * STEPS  # ranges come from an L1 alone, which nears them as slowly as it steps
+        return STEPS if memory else 6 * STEPS  # ranges come from an L1 alone, which nears them as slowly as it steps
 
     def starts(self, generator, count):
         return generator.uniform(30.0, 45.0, count)

@@ -4,9 +4,11 @@ Measured (gain / correlation / squared error over that of the last frame), worst
 vary as the roundings of machines do: bar 0.87 to 0.93 / 0.96 to 0.97 / 0.11 (1d, five) and 0.94 to 0.97 / 0.97 to 0.98
 / 0.07 (2d, five), with memory 0.92 to 0.98 / 0.96 to 0.98 / 0.05 (1d, five) and 0.96 to 1.01 / 0.95 to 0.98 / 0.05 (2d,
 five); wall 0.94 to 1.05 / 0.99 / 0.01 (1d, nine) and 0.86 to 1.06 / 0.98 to 1.0 / 0.01 (2d, nine), with memory 1.01 to
-1.07 / 0.99 / 0.01 (1d, five) and 0.99 to 1.06 / 0.99 / 0.01 (2d, twelve). Without memory the wall takes 800 steps; 200
-are too few. The 1D latent with memory passes with all of the compiler's optimisations, as the slow tests run; with most
-of them off it had 0.75 / 0.81 of the bar.
+1.07 / 0.99 / 0.01 (1d, five) and 0.99 to 1.06 / 0.99 / 0.01 (2d, twelve).
+These are after 200 steps, of the wall without memory after 800. Without memory the tests now take half as many more,
+after which the orders that were worst have 1.01 and 0.96 (wall, 2d, for 0.87 and 0.86) and 0.94 and 0.90 (bar, 1d, for
+0.91 and 0.87). The 1D latent with memory passes with all of the compiler's optimisations, as the slow tests run; with
+most of them off it had 0.75 / 0.81 of the bar.
 """
 
 import functools
@@ -41,7 +43,7 @@ def test_what_is_imagined_obeys_the_action_and_beats_the_last_frame(world, laten
     trainer = trainer_of(world, latent, memory)
     batches = [probe_worlds.windows(WORLDS[world], seed) for seed in range(probe_worlds.BATCHES)]
     found = probe_worlds.judge(trainer, trainer.train(batches))
-    assert 0.8 < found["gain"] < 1.2 and found["correlation"] > 0.94, found
+    assert 0.9 < found["gain"] < 1.2 and found["correlation"] > 0.94, found
     assert found["imagined"] < 0.2 * found["copied"], found
 
 

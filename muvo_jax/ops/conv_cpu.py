@@ -5,7 +5,8 @@ a convolution whose window is the whole image, and 3D convolutions with few chan
 need be. Here the kernel gradient is a matrix product with the shifted copies of all taps, accumulated over chunks of a
 few megabytes (or XLA's own, where there is little to do); the input gradient is an ordinary convolution with the
 flipped kernel; and a 3D convolution folds blocks of voxels along its last axis into channels, so that a banded kernel
-and a 2D convolution do the work. A layer of a few pixels and many channels is one matrix product.
+and a 2D convolution do the work. A layer of a few pixels and many channels is one matrix product, 3x3 kernels of many
+channels have fewer products (conv_winograd.py).
 
 `muvo_jax.ops.conv` is the public face; nothing here checks its arguments. Reverse-mode differentiation only.
 """
@@ -21,7 +22,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from muvo_jax.ops import precision
+from muvo_jax.ops import conv_winograd, precision, varying
 
 Pairs = tuple[tuple[int, int], ...]
 
@@ -67,6 +68,13 @@ def dense(x, kernel, padding: Pairs):
         return _folded(x, kernel, padding)
     if _is_small(x, kernel, (1, 1), padding):
         return _of_patches(x, kernel, (1, 1), padding)
+    if conv_winograd.pays(x, kernel, padding):
+        return conv_winograd.dense(x, kernel, padding)
+    return all_products(x, kernel, padding)
+
+
+def all_products(x, kernel, padding: Pairs):
+    """Stride-1 convolution in two dimensions with every product that its definition has."""
     return _dense_2d(x, kernel, padding, (1, 1))
 
 
@@ -184,7 +192,8 @@ def _correlation(still, shifted, taps: tuple[int, int], dilation: tuple[int, int
         return total + lax.dot_general(inner, jnp.concatenate(copies, axis=-1), (((0, 1, 2), (0, 1, 2)), ((), ())),
                                        precision=precision.PRODUCTS, preferred_element_type=total.dtype), None
 
-    zeros = jnp.zeros((channels, width), still.dtype if still.dtype.itemsize > 4 else jnp.float32)
+    summed = still.dtype if still.dtype.itemsize > 4 else jnp.float32
+    zeros = jnp.tile(varying.zeros(still, shifted, summed), (1, math.prod(taps)))
     total, _ = lax.scan(add_chunk, zeros, jnp.arange(batch // samples * row_chunks))
     return total.reshape(channels, *taps, -1).transpose(1, 2, 0, 3)
 

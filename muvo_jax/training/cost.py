@@ -85,7 +85,7 @@ def operations_of(planned: preparation.Planned) -> float:
 
 def operations(jaxpr: Any) -> float:
     """Floating-point operations of all products and convolutions in a jaxpr, on each device, loops counted as often as
-    they run; of branches the dearest (the platforms' forms of a convolution are branches)."""
+    they run; of branches the dearest, of the platforms' forms of a convolution that of this platform."""
     total = 0.0
     for equation in jaxpr.eqns:
         if equation.primitive.name == "dot_general":
@@ -98,11 +98,20 @@ def operations(jaxpr: Any) -> float:
             between = math.prod(equation.params["lhs_dilation"])  # of so many inputs all but one are zeros put between
             total += 2.0 * math.prod(equation.outvars[0].aval.shape) * math.prod(kernel) / outputs / between
         elif equation.primitive.name == "cond":
-            total += max(operations(branch.jaxpr) for branch in equation.params["branches"])
+            total += max(operations(branch.jaxpr) for branch in _taken(equation.params))
         else:
             times = equation.params.get("length", 1) if equation.primitive.name == "scan" else 1
             total += times * sum(operations(inner) for inner in core.jaxprs_in_params(equation.params))
     return total
+
+
+def _taken(params: Any) -> list[Any]:
+    """Branches of a `cond` that may be taken here: one, where they are forms for platforms."""
+    branches, platforms = params["branches"], params.get("branches_platforms")
+    if platforms is None:
+        return list(branches)
+    return [branch for branch, names in zip(branches, platforms, strict=True)
+            if names is None or jax.default_backend() in names][:1]
 
 
 def product_rate(dtype: Any = jnp.float32) -> float:

@@ -34,6 +34,17 @@ def test_operations_of_products_convolutions_loops_and_gradients_by_hand():
     assert of(larger, (2, 8, 8, 3), (4, 4, 3, 5)) == 2 * 2 * 8 * 8 * 16 * 3 * 5  # each input meets the kernel once
 
 
+def test_of_branches_the_dearest_counts_and_of_forms_that_of_this_platform():
+    once, twice = (lambda a, b: a @ b), (lambda a, b: (a @ b) @ b)
+    choice = lambda a, b: jax.lax.cond(a.sum() > 0, once, twice, a, b)
+    assert of(choice, (3, 5), (5, 5)) == 2 * 2 * 3 * 5 * 5
+    forms = lambda a, b: jax.lax.platform_dependent(a, b, cpu=once, default=twice)
+    elsewhere = lambda a, b: jax.lax.platform_dependent(a, b, tpu=once, default=twice)
+    assert jax.default_backend() == "cpu"
+    assert of(forms, (3, 5), (5, 5)) == 2 * 3 * 5 * 5
+    assert of(elsewhere, (3, 5), (5, 5)) == 2 * 2 * 3 * 5 * 5
+
+
 def test_a_rate_is_that_of_a_processor():
     assert 1e8 < cost.product_rate() < 1e13
 

@@ -93,8 +93,9 @@ def _kernel_gradient(x, gradient, padding: Pairs):
     gradient = jnp.pad(gradient, ((0, 0), (0, chunks.rows_in_all - rows), (0, chunks.columns - columns), (0, 0)))
 
     def add_chunk(total, index):
-        tiles = _on_both(_input_axis, chunks.inputs(index)), _on_both(_gradient_axis, chunks.of(gradient, index, 0))
-        return total + lax.dot_general(*tiles, (((2, 3, 4), (2, 3, 4)), ((0, 1), (0, 1))),
+        tiles = _on_both(_input_axis, chunks.inputs(index))
+        gradients = _on_both(_gradient_axis, chunks.of(gradient, index, 0))
+        return total + lax.dot_general(tiles, gradients, (((2, 3, 4), (2, 3, 4)), ((0, 1), (0, 1))),
                                        precision=precision.PRODUCTS), None
 
     zeros = jnp.broadcast_to(varying.zeros(x, gradient, x.dtype), (4, 4, x.shape[-1], gradient.shape[-1]))
@@ -176,6 +177,6 @@ def _outputs_of(products):
 
     samples, rows, columns, channels = products.shape[2:]
     by_column = along(products)
-    lines = zip(*(along(part) for part in by_column), strict=True)  # of even and of odd columns -> of each row
-    lines = [jnp.concatenate(line, axis=-1).reshape(samples, rows, 1, columns * 2 * channels) for line in lines]
+    by_row = zip(*(along(part) for part in by_column), strict=True)  # of each row its even and its odd columns
+    lines = [jnp.concatenate(halves, axis=-1).reshape(samples, rows, 1, columns * 2 * channels) for halves in by_row]
     return jnp.concatenate(lines, axis=2).reshape(samples, 2 * rows, 2 * columns, channels)

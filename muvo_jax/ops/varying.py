@@ -12,5 +12,5 @@ def zeros(left, right, dtype):
     A carry must vary over a mesh's axes before the first step as it does after it, where jax.shard_map checks that (its
     default), and the product over no pixel at all varies as its factors do.
     """
-    none = (value.reshape(-1, value.shape[-1])[:0] for value in (left, right))
-    return lax.dot_general(*none, (((0,), (0,)), ((), ())), preferred_element_type=jnp.dtype(dtype))
+    left, right = (value.reshape(-1, value.shape[-1])[:0] for value in (left, right))
+    return lax.dot_general(left, right, (((0,), (0,)), ((), ())), preferred_element_type=jnp.dtype(dtype))

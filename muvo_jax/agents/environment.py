@@ -19,7 +19,7 @@ import jax.numpy as jnp
 from muvo_jax import config as config_lib
 from muvo_jax import limits
 from muvo_jax import run as run_lib
-from muvo_jax.agents import episodes, forks, rewards, road, uncertainty
+from muvo_jax.agents import episodes, fits, forks, rewards, road, uncertainty
 from muvo_jax.agents.episodes import EnvParams, EnvState, StartBank, Transition
 from muvo_jax.model import checks
 from muvo_jax.model import memory as memory_lib
@@ -27,7 +27,7 @@ from muvo_jax.model.world_model import WorldModel
 from muvo_jax.ops import motion as motion_ops
 from muvo_jax.types import Array, LatentState, Variables
 
-OBSERVATIONS = ("features", "road")  # beside tuples of decoded heads
+OBSERVATIONS = fits.OBSERVATIONS
 ACTION_CHANNELS = checks.ACTION_CHANNELS
 RewardFunction = Callable[[rewards.Moment], tuple[Array, Array, dict[str, Array]]]
 
@@ -63,30 +63,7 @@ class Environment:
         limits.check(self)
         if not isinstance(self.observation, str):
             object.__setattr__(self, "observation", tuple(self.observation))  # a list has no hash
-        if not self.observation or (isinstance(self.observation, str) and self.observation not in OBSERVATIONS):
-            raise ValueError(f"Environment: observation is {self.observation!r}, expected \"features\", \"road\" or a "
-                             f"tuple of decoded heads such as (\"image\",).")
-        heads = self.decoded_heads
-        missing = [head for head in heads if head not in self.model.config.heads]
-        if missing:
-            names = ", ".join(missing)
-            raise ValueError(f"Environment: reward or observation read the head {names}, but this run trained "
-                             f"{', '.join(self.model.config.heads)}. Train it (--with-heads={','.join(missing)}); for "
-                             f"a reward without occupancy pass reward_config=RewardConfig(collision=0.0).")
-        if self._tests_collisions and "occupancy" not in self._reward_heads:
-            raise ValueError(f"Environment: the driving reward seeks collisions in occupancy, which is not among "
-                             f"reward_heads={self.reward_heads}; leave reward_heads out, or pass "
-                             f"reward_config=RewardConfig(collision=0.0).")
-        if self.ego_path is None and self.reward_function is None:
-            raise ValueError(f"Environment: the driving reward needs the ego path, contract.kinematics is "
-                             f"{self.contract.kinematics!r}, and this run trained no head ego_motion. Train it "
-                             f"(--with-heads=ego_motion), or pass a reward_function of your own.")
-        if self.caution.branches > 1 and "occupancy" not in self._reward_heads:
-            raise ValueError(f"Environment: caution.branches is {self.caution.branches}, but the reward reads no "
-                             f"occupancy in which branches could differ; expected 1, or a reward with collisions.")
-        if self._reads_obstacles:
-            grid, scale = self.model.config.voxels, self.reward_config.occupancy_scale
-            rewards.obstacle_layers(grid.shape[2] // scale, grid, self.reward_config.box, pooled=self.pooled)
+        fits.settings(self)
 
     @classmethod
     def of_run(cls, run: run_lib.Run, *, learned_reward: bool = False, **options: Any) -> Environment:
@@ -126,10 +103,15 @@ class Environment:
         return self.periods / self.contract.rate_hz
 
     @property
+    def steps_before(self) -> int:
+        """How many steps the observation looks back: road.BEFORE_S of them; 0 for any but "road"."""
+        return max(1, round(road.BEFORE_S / self.step_s)) if self.observation == "road" else 0
+
+    @property
     def decoded_heads(self) -> tuple[str, ...]:
         """What every step decodes."""
         path = ("ego_motion",) if self.ego_path == "ego_motion" else ()
-        return tuple(dict.fromkeys((*self._observed_heads, *self._reward_heads, *path)))
+        return tuple(dict.fromkeys((*self._observed_heads, *self.rewarded_heads, *path)))
 
     @property
     def _observed_heads(self) -> tuple[str, ...]:
@@ -138,18 +120,21 @@ class Environment:
         return ("occupancy",) if self.observation == "road" else tuple(self.observation)
 
     @property
-    def _tests_collisions(self) -> bool:
+    def tests_collisions(self) -> bool:
+        """Whether the driving reward looks for collisions."""
         return self.reward_function is None and self.reward_config.collision > 0
 
     @property
-    def _reads_obstacles(self) -> bool:
-        return self._tests_collisions or self.observation == "road"
+    def reads_obstacles(self) -> bool:
+        """Whether reward or observation look for what stands at the height of the car."""
+        return self.tests_collisions or self.observation == "road"
 
     @property
-    def _reward_heads(self) -> tuple[str, ...]:
+    def rewarded_heads(self) -> tuple[str, ...]:
+        """Heads that the reward reads, `reward_heads` or those of the driving reward."""
         if self.reward_heads is not None:
             return self.reward_heads
-        return ("occupancy",) if self._tests_collisions else ()
+        return ("occupancy",) if self.tests_collisions else ()
 
     @property
     def observation_shapes(self) -> Any:
@@ -175,7 +160,7 @@ class Environment:
         Raises:
           ValueError: for a bank of another model or recording, an empty one, or a horizon below 1.
         """
-        episodes.check(self.model, bank)
+        fits.starts(self, bank)
         checks.counts(horizon, None, "params")
         checks.scalar("params", temperature=temperature)
         checks.finite("params", temperature=temperature)
@@ -184,13 +169,9 @@ class Environment:
             warnings.warn(f"Environment.params: an episode of {horizon} steps is longer than the {self.trained_steps} "
                           f"that training imagined. How far this model can be trusted, python -m muvo_jax.evaluate "
                           f"RUN --uncertainty=8 measures.", stacklevel=2)
-        guessed = memory_lib.guessed_heads(self.model.config)
-        if not set(guessed).isdisjoint(self.decoded_heads) and (bank.memory is None or bank.row is None):
-            raise ValueError(f"StartBank: it has no memory, but the heads {', '.join(guessed)} of this model look at "
-                             f"what was seen of late; make it of what `observe` returned (Environment.starts).")
         seen = None
-        if self._reads_obstacles:
-            seen = episodes.seen(bank, self.model.config.voxels, self.reward_config.box)
+        if self.reads_obstacles:
+            seen = episodes.seen(bank, self.model.config.voxels, self.reward_config.box, self.steps_before)
         return EnvParams(jax.tree.map(jnp.asarray, variables), bank, jnp.int32(horizon), jnp.float32(temperature),
                          episodes.routes(bank, self.reward_config.route), seen)
 
@@ -205,7 +186,8 @@ class Environment:
         """The first moment of an episode from `start`, int32 index into the bank."""
         bank = params.bank
         return EnvState(bank.latent[start], motion_ops.at_rest_of_frame(bank.speed_mps[start]), start, jnp.int32(0),
-                        jnp.float32(0), jnp.bool_(False), jnp.float32(1))
+                        jnp.float32(0), jnp.bool_(False), jnp.float32(1),
+                        params.seen[start] if self.steps_before and params.seen is not None else None)
 
     def observe(self, state: EnvState, params: EnvParams) -> Any:
         """The observation of a state."""
@@ -224,9 +206,9 @@ class Environment:
 
     def road(self, state: EnvState, params: EnvParams, obstacles: Array) -> Array:
         """The observation "road" [road.CHANNELS] of a state with these `obstacles`."""
-        return road.observe(state.motion, params.route_of(state), obstacles, state.motion.pose,
-                            self.seen_ahead(params, state, state.time), grid=self.model.config.voxels,
-                            config=self.reward_config, pooled=self.pooled)
+        return road.observe(state.motion, params.route_of(state), episodes.Plans(obstacles, state.motion.pose),
+                            self.seen_ahead(params, state, state.time), None if state.past is None else state.past[0],
+                            grid=self.model.config.voxels, config=self.reward_config, pooled=self.pooled)
 
     def step(self, key: Array, state: EnvState, action: Array, params: EnvParams) -> tuple[EnvState, Transition]:
         """One imagined step under action [2], clipped to [-1, 1]; see Transition. No auto-reset: `restart` does it."""
@@ -255,8 +237,12 @@ class Environment:
                                 state.unharmed)
         reward, terminated, terms = self._reward(moment)
         reward = self.caution.believed(reward, state.time + 1)
+        past = state.past
+        if past is not None:
+            past = past.then(rewards.full_size(self.obstacle_plan(coarse["occupancy"]), self.model.config.voxels),
+                             motion.pose)
         after = EnvState(latent, motion, state.start, state.time + 1, reward, terminated,
-                         jnp.asarray(terms.get("unharmed", state.unharmed), jnp.float32))
+                         jnp.asarray(terms.get("unharmed", state.unharmed), jnp.float32), past)
         truncated = after.time >= params.max_steps_in_episode
         return after, Transition(self._observe(after, params, full, coarse), reward, terminated, truncated, terms), read
 
@@ -286,7 +272,7 @@ class Environment:
         if params.seen is None:
             return None
         return jnp.where(jnp.expand_dims(self.holds_seen(after_steps), (-2, -1)), jnp.broadcast_to(
-            params.seen[state.start], (*jnp.shape(after_steps), *params.seen.shape[1:])), 0.0)
+            params.seen.plan[state.start, -1], (*jnp.shape(after_steps), *params.seen.plan.shape[2:])), 0.0)
 
     def holds_seen(self, after_steps: Array) -> Array:
         """Whether what was seen at the start counts so many steps later, bool."""

@@ -16,6 +16,7 @@ from muvo_jax.agents import route as route_lib
 from muvo_jax.model import checks
 from muvo_jax.model import memory as memory_lib
 from muvo_jax.model.world_model import WorldModel
+from muvo_jax.ops import motion as motion_ops
 from muvo_jax.types import Array, Batch, LatentState, Memory, Motion, Observed, Variables
 
 
@@ -106,16 +107,43 @@ def _follow(route_maps, scale):
     return jax.vmap(lambda route_map: route_lib.follow(route_map, scale))(route_maps)
 
 
-def seen(bank: StartBank, grid: config_lib.VoxelGrid, box: rewards.EgoBox) -> Array | None:
-    """What each start's own scan showed, [M, X, Y] of rewards.seen_plan; None without memory."""
+@flax.struct.dataclass
+class Plans:
+    """What stood at the height of the car at some moments, the newest last. Leading axes [..., moments] unless said.
+
+    Attributes:
+      plan: float32 [..., X, Y] in the frame of the car of that moment, of rewards.obstacle_plan or rewards.seen_plan.
+      pose: float32 [..., 3], where that car stood, in the frame of the start.
+    """
+
+    plan: Array
+    pose: Array
+
+    def __getitem__(self, index: Any) -> Plans:
+        return jax.tree.map(lambda leaf: leaf[index], self)
+
+    def then(self, plan: Array, pose: Array) -> Plans:
+        """As many moments [moments, ...] with a new one; the oldest is forgotten."""
+        return jax.tree.map(lambda kept, new: jnp.concatenate([kept[1:], new[None]]), self, Plans(plan, pose))
+
+
+def seen(bank: StartBank, grid: config_lib.VoxelGrid, box: rewards.EgoBox, before: int) -> Plans | None:
+    """Plans [M, before + 1] of what each start's own scan showed, and the scans of so many observations before it; None
+    without memory. Where there were not so many, the oldest stands for those that are missing."""
     if bank.memory is None or bank.row is None or bank.latent.vantage is None:
         return None
-    return _seen(bank.memory.range_view, bank.row, bank.latent.vantage.last, grid, box)
+    vantage = bank.latent.vantage
+    return _seen(bank.memory.range_view, bank.memory.pose, bank.row, vantage.first, vantage.last, grid, box, before)
 
 
-@functools.partial(jax.jit, static_argnames=("grid", "box"))
-def _seen(scans, row, last, grid, box):
-    return jax.lax.map(lambda which: rewards.seen_plan(scans[which[0], which[1]], grid, box), (row, last))
+@functools.partial(jax.jit, static_argnames=("grid", "box", "before"))
+def _seen(scans, poses, row, first, last, grid, box, before):
+    index = jnp.maximum(last[:, None] + jnp.arange(-before, 1, dtype=jnp.int32)[None], jnp.maximum(first, 0)[:, None])
+    rows = jnp.broadcast_to(row[:, None], index.shape)
+    plan = jax.lax.map(lambda which: rewards.seen_plan(scans[which[0], which[1]], grid, box),
+                       (rows.reshape(-1), index.reshape(-1)))
+    pose = motion_ops.relative(poses[rows, index], poses[row, last][:, None])
+    return Plans(plan.reshape(*index.shape, *plan.shape[1:]), pose)
 
 
 @flax.struct.dataclass
@@ -128,7 +156,8 @@ class EnvParams:
       max_steps_in_episode: int32, the horizon at which an episode is truncated.
       temperature: factor on the latent noise; 0 makes the world deterministic.
       routes: Route [M, ...], the line on each start's route map, or None where there are no maps.
-      seen: float32 [M, X, Y], obstacles that each start's own scan showed (rewards.seen_plan), or None without memory.
+      seen: Plans [M, ...] of rewards.seen_plan, what each start's own scan and those before it showed, or None without
+        memory.
     """
 
     variables: Variables
@@ -136,7 +165,7 @@ class EnvParams:
     max_steps_in_episode: Array
     temperature: Array
     routes: route_lib.Route | None = None
-    seen: Array | None = None
+    seen: Plans | None = None
 
     def route_of(self, state: EnvState) -> route_lib.Route | None:
         """The route of a state's start, or None."""
@@ -156,6 +185,8 @@ class EnvState:
       terminated: bool, at that step; false at the start.
       unharmed: float32, the probability that the drive has not collided so far; 1 at the start, and where the reward's
         terms do not say it (rewards.weighed).
+      past: Plans [road.BEFORE_S earlier .. now], of scans until the start and decoded since, for the observation "road"
+        of a model with memory; else None.
     """
 
     latent: LatentState
@@ -165,6 +196,7 @@ class EnvState:
     reward: Array
     terminated: Array
     unharmed: Array | float = 1.0
+    past: Plans | None = None
 
 
 @flax.struct.dataclass

@@ -22,7 +22,7 @@ import numpy as np
 from muvo_jax.agents import environment as environment_lib
 from muvo_jax.agents import episodes, rewards, road
 from muvo_jax.agents import route as route_lib
-from muvo_jax.agents.episodes import EnvState, Transition
+from muvo_jax.agents.episodes import EnvState, Plans, Transition
 from muvo_jax.model import checks, glimpse
 from muvo_jax.model import memory as memory_lib
 from muvo_jax.ops import motion as motion_ops
@@ -40,7 +40,7 @@ class Futures:
     Attributes:
       obstacles: float32 [N, H + 1, X, Y], rewards.obstacle_plan of each moment, the start's first.
       pose: float32 [N, H + 1, 3], where the car that imagined stood, in the frame of the start.
-      seen: float32 [N, X, Y], as EnvParams.seen, or None.
+      seen: Plans [N, ...], as EnvParams.seen, or None.
       routes: Route [N, ...], or None.
       speed_mps: float32 [N], at the start.
       reward, progress_m: float32 [N, H], what the drive that imagined earned; terminated, bool [N, H].
@@ -50,7 +50,7 @@ class Futures:
 
     obstacles: Array
     pose: Array
-    seen: Array | None
+    seen: Plans | None
     routes: route_lib.Route | None
     speed_mps: Array
     reward: Array
@@ -172,28 +172,42 @@ def scattered(key: Array, speed_mps: Array) -> Motion:
 
 @flax.struct.dataclass
 class Around:
-    """What is around a car in its future after some steps, leading axes any: see Futures."""
+    """What is around a car in its future after some steps, leading axes any: see Futures.
 
-    obstacles: Array
+    Attributes:
+      obstacles: Plans, and `before` those of road.BEFORE_S earlier, or None without memory.
+      feared: float32 [..., X, Y], in the frame of `obstacles`.
+      seen: float32 [..., X, Y], in the frame of the start, or None.
+    """
+
+    obstacles: Plans
     feared: Array
-    pose: Array
     seen: Array | None
+    before: Plans | None
     route: route_lib.Route | None
 
 
 def around(environment: environment_lib.Environment, futures: Futures, index: Any, step: Array) -> Around:
     """What is around the cars in the futures `index`, an integer or a slice, `step` steps after their start."""
-    obstacles = futures.obstacles[index, step]
-    feared = obstacles if futures.feared is None else futures.feared[index, jnp.maximum(step - 1, 0)]
-    seen = None if futures.seen is None else jnp.where(environment.holds_seen(step), futures.seen[index], 0.0)
-    return Around(obstacles, feared, futures.pose[index, step], seen,
-                  jax.tree.map(lambda leaf: leaf[index], futures.routes))
+    decoded = Plans(futures.obstacles, futures.pose)
+    feared = futures.obstacles[index, step] if futures.feared is None else futures.feared[
+        index, jnp.maximum(step - 1, 0)]
+    seen = before = None
+    if futures.seen is not None:
+        back = futures.seen.pose.shape[1] - 1
+        seen = jnp.where(environment.holds_seen(step), futures.seen.plan[index, -1], 0.0)
+        later = decoded[index, jnp.maximum(step - back, 0)]
+        later = Plans(rewards.full_size(later.plan, environment.model.config.voxels), later.pose)
+        before = jax.tree.map(lambda scanned, later: jnp.where(step <= back, scanned, later),
+                              futures.seen[index, jnp.minimum(step, back)], later)
+    return Around(decoded[index, step], feared, seen, before, jax.tree.map(lambda leaf: leaf[index], futures.routes))
 
 
 def look(environment: environment_lib.Environment, here: Around, motion: Motion) -> Array:
     """The observation [CHANNELS] of one car."""
-    return road.observe(motion, here.route, here.obstacles, here.pose, here.seen, grid=environment.model.config.voxels,
-                        config=environment.reward_config, pooled=environment.pooled)
+    return road.observe(motion, here.route, here.obstacles, here.seen, here.before,
+                        grid=environment.model.config.voxels, config=environment.reward_config,
+                        pooled=environment.pooled)
 
 
 def advance(environment: environment_lib.Environment, there: Around, motion: Motion, action: Array, step: Array,
@@ -207,8 +221,8 @@ def advance(environment: environment_lib.Environment, there: Around, motion: Mot
     after = motion_ops.drive(motion, action, environment.contract, environment.periods)
     if config.collision:
         places = rewards.poses_ahead(after.pose, motion, after, config.ahead_s)
-        touched = rewards.box_collision(there.feared, motion_ops.relative(places, there.pose[None]), grid, config.box,
-                                        pooled=environment.pooled)
+        touched = rewards.box_collision(there.feared, motion_ops.relative(places, there.obstacles.pose[None]), grid,
+                                        config.box, pooled=environment.pooled)
         if there.seen is not None:
             touched = jnp.maximum(touched, rewards.box_collision(there.seen, places, grid, config.box))
         touched = touched.max()

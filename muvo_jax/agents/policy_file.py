@@ -32,7 +32,7 @@ from muvo_jax.types import Variables
 
 FOLDER = "agent"  # of a run, unless another place is named
 WEIGHTS, DESCRIPTION = "actor.safetensors", "agent.json"
-SCHEMA_VERSION = 1
+SCHEMA_VERSION = 2
 
 
 @dataclasses.dataclass(frozen=True)

@@ -163,6 +163,13 @@ def obstacle_layers(layers: int, grid: config_lib.VoxelGrid, box: EgoBox, *, poo
     return chosen
 
 
+def full_size(plan: Array, grid: config_lib.VoxelGrid) -> Array:
+    """A plan [..., x, y] of coarse occupancy as [..., X, Y]: each cell stands for all voxels that it covers."""
+    for axis in (0, 1):
+        plan = jnp.repeat(plan, grid.shape[axis] // plan.shape[axis - 2], axis=axis - 2)
+    return plan
+
+
 def seen_plan(range_view: Array, grid: config_lib.VoxelGrid, box: EgoBox) -> Array:
     """Where a scan [Hr, Wr, 4] hit something at the height of the car, but not under it: float32 [X, Y], 1 or 0."""
     points = range_view.reshape(1, -1, 4)

@@ -1,4 +1,5 @@
-"""What a driving policy sees of the road: its speed, the route ahead, and what stands on it as far as the model says.
+"""What a driving policy sees of the road: its speed, the route ahead, what stands on it as far as the model says, and
+what stood there a little earlier, which tells how others move.
 
 The observation "road" of an Environment. A pooled latent does not say where the car is in its lane (a linear read-out
 explains 4 % of the lateral offset's variance, docs/agents.md), and where something stands it says no better: pooling
@@ -14,32 +15,37 @@ import numpy as np
 from muvo_jax import config as config_lib
 from muvo_jax.agents import rewards
 from muvo_jax.agents import route as route_lib
+from muvo_jax.agents.episodes import Plans
 from muvo_jax.ops import motion as motion_ops
 from muvo_jax.types import Array, Motion
 
 ROUTE_AHEAD_M = np.array([0.0, 2.0, 4.0, 7.0, 10.0, 14.0, 18.0], np.float32)  # where the route is looked at
 CLEARANCE_M = np.array([0.0, 1.0, 2.0, 3.0, 4.0, 6.0, 8.0, 10.0, 13.0, 16.0, 20.0], np.float32)  # the car put there
 STRAIGHT_M = np.array([0.0, 2.0, 4.0], np.float32)  # the car put straight ahead of itself
-CHANNELS = 1 + 3 * ROUTE_AHEAD_M.size + CLEARANCE_M.size + STRAIGHT_M.size
+CHANNELS = 1 + 3 * ROUTE_AHEAD_M.size + 2 * (CLEARANCE_M.size + STRAIGHT_M.size)
+BEFORE_S = 0.6  # so much earlier: a car at 3 m/s has left its place by a voxel or more
 SPEED_UNIT_MPS = 10.0
 NEAREST_UNIT_M = 2.0  # places on the route come divided by their distance, the nearest ones by this
 TURN_UNIT_RAD = 0.5
 PROBABILITY_UNIT = 0.5
 
 
-def observe(motion: Motion, route: route_lib.Route | None, obstacles: Array, obstacles_pose: Array, seen: Array | None,
-            *, grid: config_lib.VoxelGrid, config: rewards.RewardConfig, pooled: bool = True) -> Array:
+def observe(motion: Motion, route: route_lib.Route | None, obstacles: Plans, seen: Array | None,
+            before: Plans | None, *, grid: config_lib.VoxelGrid, config: rewards.RewardConfig,
+            pooled: bool = True) -> Array:
     """The observation of one car: float32 [CHANNELS], each number about 1 where it is large.
 
     Speed; forward, left and turn of the route ahead in the car's frame; the probability that the car would touch
-    something if it stood at places of the route and straight ahead. Differentiable in the motion, but for these
-    probabilities, whose slopes are nothing or cliffs.
+    something if it stood at places of the route and straight ahead, and that it would have BEFORE_S earlier at the very
+    same places: where both agree, things stand. Differentiable in the motion, but for these probabilities, whose slopes
+    are nothing or cliffs.
 
     Args:
       motion: Motion [], in the frame of the start.
       route: the line on the start's route map; None counts as straight on along the start's heading.
-      obstacles: [X, Y] of rewards.obstacle_plan, in the frame of a car at `obstacles_pose` [3].
+      obstacles: Plans [] of rewards.obstacle_plan.
       seen: [X, Y] of rewards.seen_plan in the frame of the start, or None.
+      before: Plans [] of BEFORE_S earlier; None where that is not known, and everything counts as standing.
       grid, config, pooled: of the model and the reward; see rewards.box_collision.
     """
     route = route_lib.straight() if route is None else route
@@ -49,9 +55,11 @@ def observe(motion: Motion, route: route_lib.Route | None, obstacles: Array, obs
     straight = jnp.stack([jnp.asarray(STRAIGHT_M), *2 * [jnp.zeros(STRAIGHT_M.size, jnp.float32)]], axis=-1)
     places = jnp.concatenate([route_lib.ahead(route, motion.pose, CLEARANCE_M),
                               motion_ops.placed(jnp.broadcast_to(motion.pose, straight.shape), straight)])
-    blocked = rewards.box_collision(obstacles, motion_ops.relative(places, obstacles_pose[None]), grid, config.box,
-                                    pooled=pooled)
+    touches = lambda plans: rewards.box_collision(plans.plan, motion_ops.relative(places, plans.pose[None]), grid,
+                                                  config.box, pooled=pooled)
+    blocked = touches(obstacles)
     if seen is not None:
         blocked = jnp.maximum(blocked, rewards.box_collision(seen, places, grid, config.box))
+    was_blocked = blocked if before is None else touches(before)
     return jnp.concatenate([motion.speed_mps[None] / SPEED_UNIT_MPS, (ahead[:, :2] / unit_m).reshape(-1), turn,
-                            jax.lax.stop_gradient(blocked) / PROBABILITY_UNIT])
+                            jax.lax.stop_gradient(jnp.concatenate([blocked, was_blocked])) / PROBABILITY_UNIT])

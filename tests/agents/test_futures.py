@@ -1,6 +1,7 @@
 """Futures imagined once and driven many times, the observation "road", and learning in them, before a made-up wall."""
 
 import dataclasses
+import functools
 
 import jax
 import jax.numpy as jnp
@@ -8,11 +9,12 @@ import numpy as np
 import pytest
 import worlds
 
-from muvo_jax.agents import actor_critic, real_rewards, road
+from muvo_jax.agents import actor_critic, real_rewards, rewards, road
 from muvo_jax.agents import environment as environment_lib
 from muvo_jax.agents import futures as futures_lib
 from muvo_jax.agents import route as route_lib
 from muvo_jax.agents.closed_loop import Drive, Moment, Situation
+from muvo_jax.agents.episodes import Plans
 from muvo_jax.types import Motion
 
 HORIZON = 10
@@ -91,6 +93,83 @@ def test_futures_go_through_a_door(imagined):
     assert sum(leaf.size for leaf in jax.tree.leaves(first)) < 20  # where the car is; no map
 
 
+def blocked_along(observation, before=False):
+    """Probabilities [..., places] of a touch along the route, now or road.BEFORE_S earlier."""
+    first = 1 + 3 * road.ROUTE_AHEAD_M.size + before * (road.CLEARANCE_M.size + road.STRAIGHT_M.size)
+    return observation[..., first:first + road.CLEARANCE_M.size] * road.PROBABILITY_UNIT
+
+
+def remembering(thing_m):
+    """(environment, params) of two starts whose scans show one return each: of the first it stands where `thing_m`
+    [frames] says, m ahead of where the car is now, of the second likewise, seen by a car that drove there at 10 m/s."""
+    model, starts, places = worlds.with_memory(starts=2)
+    pose = jnp.zeros((2, places, 3)).at[1, :, 0].set(2.0 * jnp.arange(1.0 - places, 1.0))
+    ahead_m = jnp.asarray(thing_m)[None] - pose[..., 0]
+    point = jnp.stack([ahead_m, 0.0 * ahead_m, 1.0 + 0.0 * ahead_m, ahead_m], axis=-1)
+    scans = starts.memory.range_view.at[:, :, 0, 0].set(point)
+    last = dataclasses.replace(starts.latent.vantage, first=jnp.zeros(2, jnp.int32),
+                               last=jnp.full(2, places - 1, jnp.int32))
+    starts = dataclasses.replace(starts, latent=dataclasses.replace(starts.latent, vantage=last),
+                                 memory=dataclasses.replace(starts.memory, range_view=scans, pose=pose))
+    world = environment_lib.Environment(model, periods=2, observation="road")
+    return world, world.params(jax.tree.map(jnp.asarray, model.init(jax.random.key(0))), starts, 2)
+
+
+def test_what_stands_and_what_moves_are_told_apart():
+    """A thing 8 m ahead, and one that has come there from 4 m within 0.6 s: as a standing and as a driving car saw
+    them."""
+    world, params = remembering(np.full(7, 8.0))
+    empty = jnp.zeros(world.model.config.voxels.shape[:2])
+    look = jax.jit(lambda start, params: world.road(world.state_at(start, params), params, empty))
+    for start in range(2):
+        seen = look(jnp.int32(start), params)
+        assert blocked_along(seen).max() > 0.5
+        np.testing.assert_allclose(blocked_along(seen), blocked_along(seen, before=True), atol=1e-4)
+    world, params = remembering(np.array([4.0, 4.0, 4.0, 4.0, 5.0, 6.0, 8.0]))
+    for start in range(2):
+        seen = look(jnp.int32(start), params)
+        now, before = blocked_along(seen), blocked_along(seen, before=True)
+        first = lambda blocked: road.CLEARANCE_M[np.argmax(np.asarray(blocked) > 0.5)]
+        assert 3.0 <= first(now) - first(before) <= 5.0, "places are up to 2 m apart"
+
+
+def test_a_future_is_driven_by_what_was_seen_before_as_it_was_imagined():
+    """A policy that reads all of the observation drives a future just as it did when it imagined it, and as it does in
+    the environment: what stood where 0.6 s earlier comes from scans at first, and then from what was decoded."""
+    world, params = remembering(np.array([4.0, 4.0, 4.0, 4.0, 5.0, 6.0, 8.0]))
+    params = dataclasses.replace(params, temperature=jnp.float32(0.0))
+    mixed = jax.random.normal(jax.random.key(1), (road.CHANNELS, 2)) / road.CHANNELS**0.5
+    policy = jax.tree_util.Partial(lambda key, observation: 0.9 * jnp.tanh(observation @ mixed))
+    future = futures_lib.imagine(world, params, jax.random.key(0), jnp.arange(2), policy, 6)
+    act = lambda seen, step: (jax.vmap(policy, (None, 0))(None, seen), ())
+    observed, reward, *_ = futures_lib.drive(world, future, Motion(jnp.zeros((2, 3)), future.speed_mps), act)
+    np.testing.assert_allclose(reward.T, future.reward, atol=2e-4)
+    plan = future.obstacles[:, :4]  # until 0.6 s after the start
+    later = jnp.stack([blocked_along(seen, before=True) for seen in observed[3:]])
+    assert float(jnp.ptp(later, axis=0).max()) > 1e-3 and np.isfinite(plan).all()
+    for car in range(2):
+        state = world.state_at(jnp.int32(car), params)
+        _, played = environment_lib.play(world, params, jax.random.key(0), state, policy, 6)
+        # `imagine` works out the evidence once, which blurs it a little: what was seen is the same to rounding
+        np.testing.assert_allclose(blocked_along(played.observation[:3], before=True),
+                                   blocked_along(observed[1:4, car], before=True), atol=0.02)
+
+
+def test_what_was_before_has_one_size_at_any_scale_of_occupancy():
+    world, params = remembering(np.full(7, 8.0))
+    coarse = dataclasses.replace(world, reward_config=dataclasses.replace(world.reward_config, occupancy_scale=2))
+    policy = jax.tree_util.Partial(coast)
+    future, _ = jax.eval_shape(functools.partial(futures_lib._imagine, coarse, policy=policy, horizon=4), params,
+                               jax.random.key(0), jnp.arange(2))
+    x, y, _ = world.model.config.voxels.shape
+    assert future.obstacles.shape == (2, 5, x // 2, y // 2) and future.seen.plan.shape == (2, 4, x, y)
+    there = jax.eval_shape(lambda future: futures_lib.around(coarse, future, slice(None), jnp.int32(4)), future)
+    assert there.before.plan.shape == (2, x, y)
+    plan = rewards.full_size(jnp.arange(4.0).reshape(2, 2), dataclasses.replace(world.model.config.voxels,
+                                                                               shape=(4, 6, 2)))
+    np.testing.assert_array_equal(plan, [[0, 0, 0, 1, 1, 1]] * 2 + [[2, 2, 2, 3, 3, 3]] * 2)
+
+
 def test_a_future_has_a_derivative_in_the_actions(driven):
     """At 2 m/s nothing is near in 2 s: accelerating earns more, sooner most, steering off the route less."""
     _, slope = driven(jnp.full((HORIZON, 2, 2), 0.01, jnp.float32), jnp.full((2,), 2.0, jnp.float32))
@@ -102,11 +181,11 @@ def test_a_clearance_says_how_far_the_wall_is(imagined):
     """After five steps it is 10 m from the car's origin, and the car's front 3.7 m before that."""
     world, _, futures = imagined
     at = jax.tree.map(lambda leaf: leaf[0, 5], (futures.obstacles, futures.pose))
-    look = jax.jit(lambda motion, obstacles, pose: road.observe(
-        motion, None, obstacles, pose, None, grid=world.model.config.voxels, config=world.reward_config))(
-            Motion(at[1], jnp.float32(6.0)), *at)
+    look = jax.jit(lambda motion, obstacles: road.observe(
+        motion, None, obstacles, None, None, grid=world.model.config.voxels, config=world.reward_config))(
+            Motion(at[1], jnp.float32(6.0)), Plans(*at))
     first = 1 + 3 * road.ROUTE_AHEAD_M.size
-    blocked = look[first:first + road.CLEARANCE_M.size] * road.PROBABILITY_UNIT
+    blocked = blocked_along(look)
     near = road.CLEARANCE_M <= 10.0  # farther on the grid ends
     front_m = road.CLEARANCE_M + world.reward_config.box.front_m - 0.5  # to a quarter of a voxel, of 2 m
     np.testing.assert_array_equal(blocked[near] > 0.5, front_m[near] > 10.0)

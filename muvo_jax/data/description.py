@@ -6,7 +6,7 @@ import dataclasses
 import difflib
 import json
 import pathlib
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Mapping
 from typing import Any
 
 from muvo_jax import config as config_lib
@@ -16,6 +16,7 @@ _SECTIONS: dict[str, Callable] = {"camera": schema.Camera, "lidar": config_lib.R
                                   "voxels": config_lib.VoxelGrid, "action": config_lib.ActionContract,
                                   "route_map": config_lib.RouteMap}
 SAME_RATE = 0.01
+CALIBRATION = ("camera", "lidar_position_m")  # of a rule.json, where it was written since December 2026
 
 
 def tables(**sections) -> dict[str, dict[str, Any]]:
@@ -140,3 +141,18 @@ def check_rule(folder: pathlib.Path, grid: config_lib.VoxelGrid) -> None:
         raise schema.DataError(f"{folder}: occupancy was made for {found}, but the grid is described with {described}. "
                                f"Correct the section [voxels], or make it again (python -m muvo_jax.voxelize "
                                f"--overwrite).")
+
+
+def check_same_rule(path: pathlib.Path, how: Mapping[str, Any]) -> None:
+    """Raises FileExistsError where a rule.json says something else; without calibration it is an older one."""
+    text = files.read_bytes(path, "a rule").decode(errors="replace")
+    try:
+        found = dict(json.loads(text))
+    except (ValueError, TypeError, RecursionError):
+        found = {}
+    other = [name for name, value in how.items()
+             if found.get(name) != value and (name in found or name not in CALIBRATION)]
+    if other:
+        told = {name: found.get(name) for name in other} if found else text.strip()[:300]
+        raise FileExistsError(f"{path}: the files there were made by {told}, not by "
+                              f"{({name: how[name] for name in other})}. --overwrite removes them and makes all anew.")

@@ -67,6 +67,12 @@ class Field:
         return np.array([*values, *last_row], self.dtype).reshape(shape)
 
 
+_NO_CLASS = f", {UNKNOWN} where the class is unknown"
+# What whoever writes numbers of another type may not know.
+_WIDTH_HINTS = {"image": " (a picture of more bits keeps its highest eight)", "image_classes": _NO_CLASS,
+                "point_classes": _NO_CLASS}
+
+
 def _matrix(name: str, rows: int, columns: int) -> tuple[str, ...]:
     return tuple(f"{name}_{row}{column}" for row in range(1, rows + 1) for column in range(1, columns + 1))
 
@@ -140,6 +146,7 @@ def conform(name: str, values: Any, where: str, shape: tuple[int | None, ...] | 
         raise DataError(f"{where}: {name} holds {array.dtype}, expected {np.dtype(field.dtype).name}"
                         f"{f' in {field.unit}' if field.unit else ''}. Write it with that type and unit.")
     _check_range(field, array, where)
+    _check_width(field, array, where)
     return array.astype(field.dtype, copy=False)
 
 
@@ -170,6 +177,19 @@ def _check_range(field: Field, array: np.ndarray, where: str) -> None:
     if wrong.any():
         raise DataError(f"{where}: {field.name} has {int(wrong.sum())} of {array.size} values such as "
                         f"{array[wrong].ravel()[0]}; expected {expected}. Correct them, or leave the field out.")
+
+
+def _check_width(field: Field, array: np.ndarray, where: str) -> None:
+    """Raises DataError where a whole number does not fit into the field's type: astype would make another one of it."""
+    dtype: np.dtype[Any] = np.dtype(field.dtype)
+    if dtype.kind not in "iu" or array.dtype == dtype or not array.size:
+        return
+    low, high = int(np.iinfo(dtype).min), int(np.iinfo(dtype).max)
+    ends = [end for end in (int(array.min()), int(array.max())) if not low <= end <= high]
+    if ends:
+        raise DataError(f"{where}: {field.name} holds {ends[0]} as {array.dtype}, expected {dtype.name}, {low} to "
+                        f"{high}{_WIDTH_HINTS.get(field.name, '')}. Bring the numbers into that range, or leave the "
+                        f"field out.")
 
 
 def check_classes(name: str, classes: np.ndarray, names: tuple[str, ...], where: str) -> None:

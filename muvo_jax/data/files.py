@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import io
+import math
 import os
 import pathlib
 import struct
@@ -14,7 +15,7 @@ import warnings
 import zipfile
 import zlib
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import tomli_w
@@ -81,6 +82,36 @@ def _one_of(arrays: Mapping[str, np.ndarray], name: str) -> np.ndarray:
         with contextlib.suppress(SystemError):
             return arrays[name]
     return arrays[name]
+
+
+class NpyHeader(NamedTuple):
+    """Of an .npy file; `size` in bytes."""
+
+    shape: tuple[int, ...]
+    dtype: np.dtype
+    size: int
+
+
+def npy_header(path: pathlib.Path) -> NpyHeader | None:
+    """The header of an .npy file; None where it is cut off or damaged."""
+    with path.open("rb") as file:
+        try:
+            np.lib.format.read_magic(file)
+            shape, _, dtype = np.lib.format.read_array_header_1_0(file)
+        except (ValueError, EOFError):
+            return None
+        return NpyHeader(shape, dtype, file.tell())
+
+
+def is_whole_array(path: pathlib.Path) -> bool:
+    """Whether an .npz or .npy file is there and complete, without reading all of it."""
+    if not path.is_file():
+        return False
+    if path.suffix == ".npz":
+        return zipfile.is_zipfile(path)
+    header = npy_header(path)
+    return (header is not None and not header.dtype.hasobject
+            and path.stat().st_size == header.size + math.prod(header.shape) * header.dtype.itemsize)
 
 
 def npz_names(path: pathlib.Path) -> frozenset[str] | None:

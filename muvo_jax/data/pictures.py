@@ -22,6 +22,7 @@ _USUAL = ("PNG", "JPEG")  # as Pillow names them
 _FORMATS = (*_USUAL, "BMP", "TIFF")
 MODES = ("RGB", "RGBA", "L", "classes", "depth_m")
 _PNG_BITS = 24  # where a PNG says how many bits a sample has
+_PNG_CHUNKS = 8  # where its first chunk begins
 _GREY_SPREADS = {2: 85, 4: 17}
 # Pillow raises any of these for broken chunks and for sizes that would fill the memory.
 _IMAGE_ERRORS = (OSError, SyntaxError, ValueError, TypeError, IndexError, OverflowError, MemoryError, zlib.error,
@@ -80,6 +81,8 @@ def decode(content: bytes, mode: str | None, where: str, shape: tuple[int, ...] 
             if shape is not None and sorted((image.height, image.width)) != sorted(shape[:2]):
                 raise schema.DataError(f"{where}: a picture of {image.width}x{image.height} pixels, expected "
                                        f"{list(shape)}")
+            if image.format == "PNG":
+                _check_chunks(content)
             pixels = _pixels(image, mode, where, content)
             kept = _keeping.get()
             if kept is not None and mode is not None and image.format in _USUAL:
@@ -96,6 +99,22 @@ def decode(content: bytes, mode: str | None, where: str, shape: tuple[int, ...] 
 def decode_depth(pixels: np.ndarray) -> np.ndarray:
     """Centimetres (16 bit) to float32 metres, infinite in the sky; the inverse of plain.writer.encode_depth."""
     return np.where(pixels == DEPTH_SKY, np.float32(np.inf), pixels.astype(np.float32) * np.float32(DEPTH_UNIT_M))
+
+
+def _check_chunks(content: bytes) -> None:
+    """Raises ValueError where a PNG is not as it was written; Pillow does not look at the checksum of pixels."""
+    view, start = memoryview(content), _PNG_CHUNKS
+    while start + 12 <= len(content):
+        length, name = struct.unpack_from(">I4s", content, start)
+        stop = start + 8 + length
+        if stop + 4 > len(content):
+            break
+        if zlib.crc32(view[start + 4:stop]) != struct.unpack_from(">I", content, stop)[0]:
+            raise ValueError(f"the checksum of its part {name.decode('latin-1')} at byte {start} is wrong")
+        if name == b"IEND":
+            return
+        start = stop + 4
+    raise ValueError(f"it ends after {len(content)} bytes, before its part IEND")
 
 
 def _pixels(image: Image.Image, mode: str | None, where: str, content: bytes) -> np.ndarray:

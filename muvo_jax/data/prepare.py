@@ -110,7 +110,8 @@ def _labels(raw: schema.RawFrame, config: config_lib.Config) -> PreparedFrame:
     model, targets = config.model, head_lib.targets(config)
     if "depth_m" in raw and "depth_m" in targets:
         depth_m = camera_ops.resize_crop_nearest(raw["depth_m"], model.image_size)
-        ready["depth_m"] = np.where(depth_m < DEPTH_LIMIT_M, depth_m, range_view_ops.NO_RETURN_M).astype(np.float32)
+        known = (depth_m > 0) & (depth_m < DEPTH_LIMIT_M)
+        ready["depth_m"] = np.where(known, depth_m, range_view_ops.NO_RETURN_M).astype(np.float32)
     for name in ("image_classes", "image_instance_mask"):
         if name in raw and name in targets:
             ready[name] = camera_ops.resize_crop_nearest(raw[name], model.image_size)  # type: ignore[literal-required]

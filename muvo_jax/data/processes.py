@@ -11,6 +11,7 @@ import threading
 from collections.abc import Callable, Iterable, Iterator
 from concurrent import futures
 from concurrent.futures import process
+from multiprocessing.synchronize import Event
 from typing import Any, TypeVar
 
 import filelock
@@ -40,22 +41,28 @@ def spread(work: Callable[..., _Result], tasks: Iterable[Any], *, shared: tuple,
 
     Raises:
       Exception: what `work` raises, as it is; tasks that have not begun are given up.
-      WorkerError: where a process is killed.
+      WorkerError: where a process is killed, or none can start.
     """
-    pool = futures.ProcessPoolExecutor(workers, multiprocessing.get_context("spawn"), _begin, (shared,))
+    context = multiprocessing.get_context("spawn")
+    begun = context.Event()
+    pool = futures.ProcessPoolExecutor(workers, context, _begin, (shared, begun))
     try:
         for future in futures.as_completed([pool.submit(_run, work, task) for task in tasks]):
             yield future.result()
     except process.BrokenProcessPool as error:
+        if not begun.is_set():  # a fresh process runs the caller's script once more, up to this call
+            raise WorkerError(f"no {doing} process could start. In a script, call it below if __name__ == "
+                              f"\"__main__\"; in code that comes from stdin, with workers=1.") from error
         raise WorkerError(f"a {doing} process was killed (is memory short?); run again, what is complete is "
                           f"kept.") from error
     finally:
         pool.shutdown(cancel_futures=True)
 
 
-def _begin(shared: tuple) -> None:
+def _begin(shared: tuple, begun: Event) -> None:
     global _shared
     _shared = shared
+    begun.set()
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the command's own process tells the others to stop
     threading.Thread(target=_end_with_parent, daemon=True).start()
 

@@ -8,8 +8,8 @@ and label for label as the authors' generate_voxels.
     MUVO layout, carved         <run>/occupancy/occupancy_000000012.npz; their code does not look there, ours does
     MUVO layout, reference      <run>/voxel/voxel_000000012.npy, and the column voxel_path in pd_dataframe.pkl
 
-Files are numbered as the frame's others. rule.json beside them says how they were made; files of two rules or grids
-are never mixed.
+Files are numbered as the frame's others. rule.json beside them says how they were made; files of two rules, grids or
+calibrations are never mixed.
 """
 
 from __future__ import annotations
@@ -20,9 +20,8 @@ import json
 import math
 import pathlib
 import shutil
-import zipfile
-from collections.abc import Callable, Collection
-from typing import NamedTuple
+from collections.abc import Callable, Collection, Mapping
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -45,12 +44,15 @@ _LEVEL = ((0, 0, 1), (-1, 0, 0), (0, -1, 0))
 
 
 class Frame(NamedTuple):
-    """The files of one frame, two to read, one to write; and its intrinsics and camera_to_ego, if not the Rig's."""
+    """The files of one frame, two to read, one to write; its intrinsics and camera_to_ego, if not the Rig's, and the
+    table that they stand in, if they are the frame's own.
+    """
 
     depth: pathlib.Path
     points: pathlib.Path
     target: pathlib.Path
     calibration: schema.RawFrame | None = None
+    table: pathlib.Path | None = None
 
 
 class Rig(NamedTuple):
@@ -72,7 +74,8 @@ class Result(NamedTuple):
 
 def voxelize(path: pathlib.Path | str, *, rule: str = "carved", overwrite: bool = False, workers: int | None = None,
              progress: Callable[[int, int], None] | None = None) -> Result:
-    """Makes what is missing of the occupancy of a recording; whole files that are there are kept.
+    """Makes what is missing of the occupancy of a recording, and again what is older than the depth map, scan or
+    camera that it was made of; other whole files that are there are kept.
 
     Args:
       path: a plain recording, or any folder of the MUVO layout (all its runs and frames, as in the authors' tool).
@@ -84,7 +87,7 @@ def voxelize(path: pathlib.Path | str, *, rule: str = "carved", overwrite: bool 
     Raises:
       DataError: for a path of another kind, without depth or lidar, without a described grid; or, when all other
         frames are done, for frames that cannot be made.
-      FileExistsError: where files of another rule or grid are there, or of one that no rule.json says.
+      FileExistsError: where files of another rule, grid or calibration are there, or of one that no rule.json says.
       BlockingIOError: where another process works on `path`.
       RuntimeError: where a worker was killed.
     """
@@ -95,13 +98,15 @@ def voxelize(path: pathlib.Path | str, *, rule: str = "carved", overwrite: bool 
     frames = [frame for run in runs.values() for frame in run]
     with processes.locked(path / _LOCK_FILE, "voxelizing"):
         processes.check_free(_other_locks(path, runs), "voxelizing")
-        rule_text = json.dumps({"rule": rule} | dataclasses.asdict(rig.grid)) + "\n"  # description.check_rule reads it
-        for folder in {frame.target.parent for frame in frames}:
-            _clear(folder, rule_text, overwrite)
-        missing = [frame for frame in frames if not is_whole(frame.target)]
+        how, folders = _how(rig), {frame.target.parent for frame in frames}
+        ours = {folder for folder in folders if (folder / files.RULE_FILE).is_file()}
+        for folder in folders:
+            _clear(folder, how, overwrite)
+        missing = [frame for frame in frames if not files.is_whole_array(frame.target)
+                   or (frame.target.parent in ours and _is_stale(frame))]
         for folder in {frame.target.parent for frame in missing}:
             folder.mkdir(exist_ok=True)
-            files.write_atomically(folder / files.RULE_FILE, rule_text)
+            files.write_atomically(folder / files.RULE_FILE, json.dumps(how) + "\n")
         kept = len(frames) - len(missing)
         chunks = [missing[first:first + _CHUNK] for first in range(0, len(missing), _CHUNK)]
         workers = min(workers or processes.processors(), len(chunks))
@@ -144,36 +149,6 @@ def make_frames(rig: Rig, frames: list[Frame]) -> list[str]:
         else:
             outcomes.append("")
     return outcomes
-
-
-def is_whole(path: pathlib.Path) -> bool:
-    """Whether an .npz or .npy file is there and complete, without reading all of it."""
-    if not path.is_file():
-        return False
-    if path.suffix == ".npz":
-        return zipfile.is_zipfile(path)
-    header = _npy_header(path)
-    return (header is not None and not header.dtype.hasobject
-            and path.stat().st_size == header.size + math.prod(header.shape) * header.dtype.itemsize)
-
-
-class _Header(NamedTuple):
-    """Of an .npy file; `size` in bytes."""
-
-    shape: tuple[int, ...]
-    dtype: np.dtype
-    size: int
-
-
-def _npy_header(path: pathlib.Path) -> _Header | None:
-    """None where it is cut off or damaged."""
-    with path.open("rb") as file:
-        try:
-            np.lib.format.read_magic(file)
-            shape, _, dtype = np.lib.format.read_array_header_1_0(file)
-        except (ValueError, EOFError):
-            return None
-        return _Header(shape, dtype, file.tell())
 
 
 def carved_occupancy(depth_m: np.ndarray, points_m: np.ndarray, intrinsics: np.ndarray, camera_to_ego: np.ndarray,
@@ -240,7 +215,10 @@ def _survey_plain(path: pathlib.Path, rule: str) -> tuple[Rig, dict[pathlib.Path
     for run in plain_reader.read_runs(path, description.splits(header, toml_path)):
         cameras.check(run.columns, camera, run.folder / plain_reader.FRAMES_FILE)
         depths, scans, targets = (plain_reader.frame_files(run, name) for name in ("depth_m", "points_m", "occupancy"))
-        runs[run.folder] = [Frame(depths[row], scans[row], targets[row], cameras.of_frame(run.columns, row, camera))
+        has_own = any(field.columns[0] in run.columns for field in cameras.FIELDS)
+        table = run.folder / plain_reader.FRAMES_FILE if has_own else None
+        runs[run.folder] = [Frame(depths[row], scans[row], targets[row], cameras.of_frame(run.columns, row, camera),
+                                  table)
                             for row in range(len(depths))]
     return Rig(False, rule, camera, lidar.position_m, grid), runs
 
@@ -263,16 +241,31 @@ def _survey_muvo(path: pathlib.Path, rule: str) -> tuple[Rig, dict[pathlib.Path,
     return Rig(True, rule, camera, (lidar or muvo_reader.LIDAR).position_m, grid or muvo_reader.VOXELS), runs
 
 
-def _clear(folder: pathlib.Path, rule_text: str, overwrite: bool) -> None:
+def _how(rig: Rig) -> dict[str, Any]:
+    """What rule.json says: rule and grid, which description.check_rule reads, and how the sensors sit."""
+    camera = None if rig.camera is None else {name: getattr(rig.camera, name) for name in ("intrinsics",
+                                                                                          "camera_to_ego")}
+    said = {"rule": rig.rule} | dataclasses.asdict(rig.grid)
+    said |= dict(zip(description.CALIBRATION, (camera, rig.lidar_position_m), strict=True))
+    return json.loads(json.dumps(said))
+
+
+def _is_stale(frame: Frame) -> bool:
+    """Whether what a frame's file was made of was changed since."""
+    made_ns = frame.target.stat().st_mtime_ns
+    return any(path is not None and path.is_file() and path.stat().st_mtime_ns > made_ns
+               for path in (frame.depth, frame.points, frame.table))
+
+
+def _clear(folder: pathlib.Path, how: Mapping[str, Any], overwrite: bool) -> None:
     """Removes what an interrupted write left in a folder of results, and all results where that is wanted."""
     path = folder / files.RULE_FILE
     if overwrite:
         for old in folder.glob("*.np[yz]"):
             old.unlink()
-    elif path.is_file() and (found := files.read_bytes(path, "a rule").decode(errors="replace")) != rule_text:
-        raise FileExistsError(f"{path}: the files there were made by {found.strip()[:300]}, not by "
-                              f"{rule_text.strip()}. --overwrite removes them and makes all anew.")
-    elif not path.is_file():
+    elif path.is_file():
+        description.check_same_rule(path, how)
+    else:
         _check_unruled(folder)
     for draft in folder.glob(".*.np[yz].*"):
         draft.unlink()
@@ -284,7 +277,7 @@ def _check_unruled(folder: pathlib.Path) -> None:
     Tables that are cut off pass, too: they are made again.
     """
     for path in sorted(folder.glob("[!.]*.np[yz]")):
-        header = _npy_header(path) if path.suffix == ".npy" else None
+        header = files.npy_header(path) if path.suffix == ".npy" else None
         if header is not None and (len(header.shape) != 2 or header.shape[1] != 4 or header.dtype.kind not in "ui"):
             raise FileExistsError(f"{path}: {header.dtype} {list(header.shape)}, expected a table of voxels, whole "
                                   f"numbers [M, 4]. --overwrite removes the files there and makes all anew.")

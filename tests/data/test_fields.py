@@ -261,3 +261,17 @@ def test_a_link_to_nowhere_is_no_file(tmp_path):
     (tmp_path / "000003.png").symlink_to(tmp_path / "000002.png")
     assert files.numbered(tmp_path, ".png") == {2: "000002.png", 3: "000003.png"}
     assert files.names_in(tmp_path / "none") == []
+
+
+@pytest.mark.parametrize(("name", "values", "message"), [
+    ("image", np.full((4, 4, 3), 300, np.uint16), r"image holds 300 as uint16, expected uint8, 0 to 255 \(a picture"),
+    ("route_map", np.full((64, 64), 511), "route_map holds 511 as int64"),
+    ("point_classes", np.full(5, 256, np.uint32), "point_classes holds 256 as uint32"),
+    ("image_classes", np.full((4, 4), -1, np.int16), "image_classes holds -1 as int16, .*255 where the class is unkn"),
+    ("birds_eye_instances", np.full((2, 2), 2**32 + 7), "birds_eye_instances holds 4294967303 as int64"),
+])
+def test_whole_numbers_that_the_type_cannot_hold_are_refused(name, values, message):
+    with pytest.raises(schema.DataError, match=f"here: {message}"):
+        fields.conform(name, values, "here")
+    fits = fields.conform(name, np.full_like(values, 7), "here")
+    assert fits.dtype == fields.FIELDS[name].dtype and (fits == 7).all()

@@ -322,3 +322,17 @@ def test_frames_without_what_the_model_needs_are_refused_by_name(tmp_path):
     del frame["points_m"]
     with pytest.raises(schema.DataError, match="frame 0 has no points_m, which the model needs"):
         prepare.prepare_frame(frame, config)
+
+
+@pytest.mark.parametrize("damage", [
+    lambda content: content[:-300] + bytes(300),
+    lambda content: content[:200] + bytes([content[200] ^ 1]) + content[201:],
+    lambda content: content[:300] + bytes(64) + content[364:],
+    lambda content: content[:-12]], ids=["zeros at the end", "a flipped bit", "zeros", "without IEND"])
+def test_a_damaged_png_is_not_read_with_other_pixels(tmp_path, damage):
+    path = tmp_path / "a.png"
+    save(path, np.random.default_rng(0).integers(0, 4, (64, 64), np.uint8), compress_level=1)
+    assert pictures.read(path, "L").shape == (64, 64) and len(path.read_bytes()) > 900
+    path.write_bytes(damage(path.read_bytes()))
+    with pytest.raises(schema.DataError, match=r"a\.png: not a readable image .*truncated or damaged"):
+        pictures.read(path, "L")

@@ -2,6 +2,8 @@
 
 import os
 import signal
+import subprocess
+import sys
 import threading
 
 import pytest
@@ -77,3 +79,15 @@ def test_a_file_that_cannot_be_written_leaves_no_draft(tmp_path, monkeypatch):
     with pytest.raises(OSError, match="No space left"):
         files.write_atomically(tmp_path / "plan.json", "ours")
     assert not list(tmp_path.iterdir())
+
+
+def test_workers_that_cannot_start_are_told_from_killed_ones():
+    script = """
+from muvo_jax.data import processes
+try:
+    list(processes.spread(abs, [1, 2], shared=(), workers=2, doing="halving"))
+except processes.WorkerError as error:
+    print("told:", error)
+"""
+    done = subprocess.run([sys.executable, "-"], input=script, capture_output=True, text=True, timeout=120, check=False)
+    assert "told: no halving process could start." in done.stdout and "workers=1" in done.stdout

@@ -55,6 +55,14 @@ def test_the_town_teaches_every_optional_head(recording):
     assert sky.any() and (batch.depth_m[0, 0][sky] == -1).all() and batch.depth_m.max() <= prepare.DEPTH_LIMIT_M
 
 
+def test_a_depth_of_zero_is_no_target(recording):
+    raw = recording.read(recording.sequences[0], 0)
+    raw["depth_m"] = np.full_like(raw["depth_m"], 5.0)
+    raw["depth_m"][:, :8] = 0.0
+    depth_m = prepare.prepare_frame(raw, CONFIG)["depth_m"]
+    assert set(np.unique(depth_m)) == {-1.0, 5.0}
+
+
 def test_scores_are_told_where_road_users_move_and_training_is_not(recording):
     config = fitting.adapt(dataclasses.replace(CONFIG, data=dataclasses.replace(CONFIG.data, stride=1)),
                            recording).config

@@ -1,5 +1,7 @@
 """Occupancy from depth and lidar: the authors' own voxel files, carving worked by hand, and interruptions."""
 
+import json
+import os
 import shutil
 
 import numpy as np
@@ -107,6 +109,36 @@ def test_whole_files_are_kept_and_half_ones_made_again(recording):
     assert voxelizing.voxelize(recording, workers=1) == (2, 2)
     assert (folder / "000000.npz").read_bytes() == whole and theirs.read_bytes() == kept
     assert sorted(path.name for path in folder.iterdir()) == ["000000.npz", "000001.npz", "rule.json"]
+
+
+def test_occupancy_is_not_kept_where_what_it_was_made_of_was_corrected(recording):
+    voxelizing.voxelize(recording, workers=1)
+    depth = recording / "train/a/depth/000001.png"
+    Image.fromarray(np.array([[0, 0, 0], [0, 300, 0], [0, 0, 0]], np.uint16)).save(depth)
+    made_ns = (recording / "train/a/occupancy/000001.npz").stat().st_mtime_ns
+    os.utime(depth, ns=(made_ns + 1_000_000, made_ns + 1_000_000))
+    assert voxelizing.voxelize(recording, workers=1) == (1, 3)
+    assert np.argwhere(occupancy(recording, frame=1) == 1).tolist() == [[3, 8, 2], [4, 13, 2]]
+    header = recording / plain_reader.DESCRIPTION_FILE
+    header.write_text(header.read_text().replace(CAMERA_TO_EGO, CAMERA_TO_EGO.replace("-7.5", "-6.5")))
+    with pytest.raises(FileExistsError, match=r"made by \{'camera': .*-7\.5.*, not by .*-6\.5.*--overwrite"):
+        voxelizing.voxelize(recording, workers=1)
+    for path in recording.glob("*/*/occupancy/rule.json"):  # as it was before calibrations were noted
+        path.write_text(json.dumps({name: value for name, value in json.loads(path.read_text()).items()
+                                    if name not in ("camera", "lidar_position_m")}))
+    assert voxelizing.voxelize(recording, workers=1).kept == 4
+
+
+def test_cameras_of_single_frames_that_were_corrected_make_occupancy_anew(recording):
+    table = recording / "train/a/frames.csv"
+    header, *rows = table.read_text().split()
+    columns = ",".join(fields.FIELDS["intrinsics"].columns)
+    table.write_text("\n".join([f"{header},{columns}", *(f"{row},1,0,1.5,0,1,1.5" for row in rows)]) + "\n")
+    voxelizing.voxelize(recording, workers=1)
+    made_ns = max(path.stat().st_mtime_ns for path in recording.glob("*/*/occupancy/*.npz"))
+    for run in ("train/a", "val_rl/c"):  # the second has no camera of its own
+        os.utime(recording / run / "frames.csv", ns=(made_ns + 1_000_000, made_ns + 1_000_000))
+    assert voxelizing.voxelize(recording, workers=1) == (2, 2)
 
 
 @pytest.mark.parametrize("rule", voxelizing.RULES)

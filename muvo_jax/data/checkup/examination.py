@@ -133,6 +133,10 @@ def examine(recording: schema.Recording, warned: Iterable[str] = (), *, frames: 
     found += [*judgements.of_splits(recording), *judgements.of_actions(motion, recording.description.contract),
               *judgements.of_time(motion, recording.description.rate_hz), *judgements.of_units(motion),
               *figures.findings()]
+    if (camera := recording.description.camera) is not None:
+        own = [(frame["intrinsics"], frame["camera_to_ego"]) for _, frame in samples if "intrinsics" in frame]
+        found += judgements.of_cameras([(np.array(camera.intrinsics), np.array(camera.camera_to_ego)), *own],
+                                       camera.width_px, camera.height_px)
     if fit is not None:
         found += judgements.of_alignment(fit, recording)
     found += [judgements.Finding("remark", note) for note in recording.description.notes]

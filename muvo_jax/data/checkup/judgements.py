@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Iterable
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -17,17 +18,23 @@ _WINDOW_FRAMES = 23
 MOVING_MPS = 1.0
 _TURNING_RADPS = 0.02
 _FEWEST_SAMPLES = 30
+_PITCH_RAD, _LEAST_DOWN, _BACKWARDS = math.radians(45.0), -0.5, -0.5  # of cameras on cars
+_OFF_CENTRE = 0.25  # of the picture's side; a crop may be the reason
 _MISALIGNED_RAD = math.radians(1.0)  # less is no problem, nor is what the lidar's beams cannot tell
 _UNIT_FACTOR = 1.8  # a speed this many times too large or too small is of another unit
 _SPEED_UNITS = {"km/h": 3.6, "mph": 2.237, "km/s": 0.001, "cm/s": 100.0}
+_LEAST_RATIO, _MOST_RATIO = 0.5, 2.0  # what is farther from what it should be is of another unit or scale
 _HEADING_M = 0.3  # a step so long has a direction
 _OPPOSED, _TOGETHER = -0.5, 0.5  # correlations
+
+
+Level = Literal["problem", "remark"]
 
 
 class Finding(NamedTuple):
     """Something about a recording: a "problem" should be mended before training, a "remark" should be known."""
 
-    level: Literal["problem", "remark"]
+    level: Level
     text: str
 
 
@@ -98,6 +105,8 @@ def of_actions(motion: DrivingLog, contract: config_lib.ActionContract) -> list[
         gained = sound & np.isfinite(motion.acceleration_mps2) & np.isfinite(motion.speed_mps)
         found += _agreement("acceleration", "change of speed", action[gained, 0], motion.acceleration_mps2[gained],
                             1e-2, 0.1)
+        if contract.kinematics == "bicycle" and _is_of_unit(_yaw_rate_ratio(motion)):
+            found += _turn_gain(motion, turning & (np.abs(action[:, 1]) <= 1.0), contract)
         if contract.kinematics == "bicycle" and gained.sum() >= _FEWEST_SAMPLES:
             found += _gain(action[gained, 0], motion.acceleration_mps2[gained], contract)
     if not np.isfinite(motion.yaw_rate_radps).any():
@@ -125,10 +134,49 @@ def _gain(acceleration: np.ndarray, measured_mps2: np.ndarray, contract: config_
     if expected.std() < 0.1:
         return []
     gain = float((expected * measured_mps2).sum() / (expected ** 2).sum())
-    if 0.5 < gain < 2.0 or gain <= 0:  # a wrong sign has its own finding
+    if _is_of_unit(gain) or gain <= 0:  # a wrong sign has its own finding
         return []
     return [Finding("problem", f"the car accelerates {gain:.2f} times what the action contract says; correct "
                                f"accel_full_mps2 and brake_full_mps2, or say kinematics = \"none\".")]
+
+
+def _turn_gain(motion: DrivingLog, turning: np.ndarray, contract: config_lib.ActionContract) -> list[Finding]:
+    """Whether steering turns the car as the contract says, in the frames `turning` [F]."""
+    if turning.sum() < _FEWEST_SAMPLES:
+        return []
+    measured_radps = motion.yaw_rate_radps[turning]
+    wheel_rad = np.clip(motion.action[turning, 1] * contract.steer_full_rad, -1.5, 1.5)
+    expected_radps = -motion.speed_mps[turning] * np.tan(wheel_rad) / contract.wheelbase_m
+    if measured_radps.std() < _TURNING_RADPS or expected_radps.std() < 1e-6 or (
+            np.corrcoef(expected_radps, measured_radps)[0, 1] < _TOGETHER):
+        return []
+    gain = float((expected_radps * measured_radps).sum() / (expected_radps ** 2).sum())
+    if _is_of_unit(gain):
+        return []
+    unit = " Or is yaw_rate_radps in degrees per second?" if 0.8 < gain / math.degrees(1.0) < 1.25 else ""
+    return [Finding("problem", f"the car turns {gain:.2f} times as fast as the action contract says; correct "
+                               f"steer_full_rad (of the wheels, not of the steering wheel) and wheelbase_m, or say "
+                               f"kinematics = \"none\".{unit}")]
+
+
+def _is_of_unit(ratio: float | None) -> bool:
+    """Whether what was measured is of the order that it should be, or nothing is known of it."""
+    return ratio is None or _LEAST_RATIO < ratio < _MOST_RATIO
+
+
+def _yaw_rate_ratio(motion: DrivingLog) -> float | None:
+    """The recorded yaw rate over the change of yaw in a second; None where the car turns too little to tell."""
+    if motion.pose is None or len(motion.pose) < 2:
+        return None
+    steps_s = np.diff(motion.timestamp_s)
+    turned_rad = (np.diff(motion.pose[:, 2]) + np.pi) % (2 * np.pi) - np.pi
+    with np.errstate(divide="ignore", invalid="ignore"):
+        turned_radps = turned_rad / steps_s
+        usable = (np.diff(motion.stretch) == 0) & (steps_s > 0) & (np.abs(turned_radps) > _TURNING_RADPS)
+    usable &= np.isfinite(motion.yaw_rate_radps[:-1])
+    if usable.sum() < _FEWEST_SAMPLES:
+        return None
+    return float(np.median(motion.yaw_rate_radps[:-1][usable] / turned_radps[usable]))
 
 
 def of_time(motion: DrivingLog, rate_hz: float) -> list[Finding]:
@@ -172,7 +220,49 @@ def of_units(motion: DrivingLog) -> list[Finding]:
         if ratio > 0.5 * math.degrees(1.0):
             found.append(Finding("problem", f"yaw turns {ratio:.0f} times as much as the path: it must be in radians, "
                                             f"not degrees."))
+            return found
+    rate_ratio = _yaw_rate_ratio(motion)
+    if rate_ratio is not None and not _is_of_unit(rate_ratio):
+        unit = " (degrees?)" if 0.8 < abs(rate_ratio) / math.degrees(1.0) < 1.25 else ""
+        found.append(Finding("problem", f"yaw_rate_radps is {rate_ratio:.2f} times what yaw turns by in a second; it "
+                                        f"must be in radians per second{unit}, to the left as yaw."))
     return found
+
+
+def of_cameras(cameras: Iterable[tuple[np.ndarray, np.ndarray]], width_px: int, height_px: int) -> list[Finding]:
+    """Whether cameras look as one on a car does: upright, not to the sky or the ground, through the picture's middle.
+
+    Args:
+      cameras: intrinsics [3, 3] and camera_to_ego [4, 4] of each; what several have is said once.
+    """
+    found: dict[str, Finding] = {}
+
+    def say(what: str, level: Level, text: str) -> None:
+        found.setdefault(what, Finding(level, text))
+
+    for intrinsics, pose in cameras:
+        down, ahead = pose[:3, 1], pose[:3, 2]
+        pitch_rad = math.asin(float(np.clip(ahead[2], -1.0, 1.0)))
+        if down[2] > _LEAST_DOWN:
+            say("down", "problem", f"the camera's down axis, the second column of camera_to_ego, is "
+                                   f"({', '.join(f'{value:.2f}' for value in down)}) in the ego frame, expected about "
+                                   f"(0, 0, -1). Camera axes are x right, y down, z forward; is camera_to_ego "
+                                   f"inverted, or of other axes?")
+        elif abs(pitch_rad) > _PITCH_RAD:
+            say("pitch", "problem", f"the camera looks {abs(math.degrees(pitch_rad)):.0f} degrees "
+                                    f"{'up' if pitch_rad > 0 else 'down'}; check camera_to_ego, whose third column is "
+                                    f"the optical axis.")
+        elif ahead[0] < _BACKWARDS:
+            say("back", "remark", "the camera looks backwards; where it should look ahead, turn camera_to_ego by half "
+                                  "a turn.")
+        for name, place_px, side_px in (("cx", intrinsics[0, 2], width_px), ("cy", intrinsics[1, 2], height_px)):
+            if not 0 <= place_px <= side_px:
+                say(name, "problem", f"{name} = {place_px:.4g} lies outside of {side_px} pixels; intrinsics must be "
+                                     f"those of the stored pictures, {width_px}x{height_px}.")
+            elif abs(place_px / side_px - 0.5) > _OFF_CENTRE:
+                say(name, "remark", f"{name} = {place_px:.4g} lies far from the middle of {side_px} pixels; are "
+                                    f"intrinsics those of pictures of {width_px}x{height_px}?")
+    return list(found.values())
 
 
 def of_alignment(fit: alignment_lib.Alignment, recording: schema.Recording) -> list[Finding]:

@@ -28,7 +28,7 @@ from collections.abc import Collection
 import numpy as np
 
 from muvo_jax import config as config_lib
-from muvo_jax.data import ego_motion, files, pictures, schema, sequences
+from muvo_jax.data import ego_motion, files, pictures, runs, schema, sequences
 from muvo_jax.data.kitti import files as kitti_files
 from muvo_jax.data.kitti.files import LIDAR_HEIGHT_M, read_camera, read_oxts, read_pose, read_scan
 from muvo_jax.limits import between
@@ -103,7 +103,7 @@ class KittiRecording:
         if not folders:
             raise files.missing(path / "<date>_drive_NNNN_sync", "a KITTI raw drive")
         self._camera = camera
-        every = {folder: {sensor for sensor in (*CAMERAS, *_SUFFIXES) if _files(folder, sensor)} for folder in folders}
+        every = {folder: _sensors(folder, camera) for folder in folders}
         self._sensors = _shared_sensors(every, camera)
         others = [name for name in CAMERAS if any(name in has for has in every.values())]
         if camera not in self._sensors and (others or len(self._sensors) < 2):
@@ -112,9 +112,10 @@ class KittiRecording:
                                    f"name a camera that is there.")
         whole = [folder for folder in folders if every[folder].issuperset(self._sensors)]
         if not whole:
-            raise _lacking(folders[0], self._sensors)
+            raise _lacking(folders[0], self._sensors, every[folders[0]])
         for folder in sorted(set(folders) - set(whole)):
-            warnings.warn(f"{_lacking(folder, self._sensors)} The drive is left out.", schema.DataWarning, stacklevel=2)
+            warnings.warn(f"{_lacking(folder, self._sensors, every[folder])} The drive is left out.",
+                          schema.DataWarning, stacklevel=2)
         self._drives = {name: _open_drive(folder, self._sensors) for name, folder in _named(whole, path).items()}
         steps = np.concatenate([np.diff(drive.timestamps_s) for drive in self._drives.values()])
         period_s = float(np.nanmedian(steps)) if np.isfinite(steps).any() else 1.0 / CONTRACT.rate_hz
@@ -226,6 +227,21 @@ def _files(folder: pathlib.Path, sensor: str) -> dict[int, str]:
     return files.numbered(folder / sensor / "data", _SUFFIXES.get(sensor, _IMAGE_SUFFIXES))
 
 
+def _sensors(folder: pathlib.Path, camera: str) -> set[str]:
+    """Those that a drive has. The chosen camera and the lidar need half of the frames that either has: a few pictures
+    would take away the scans of all other frames. Warns of less.
+    """
+    numbers = {sensor: set(_files(folder, sensor)) for sensor in (*CAMERAS, *_SUFFIXES)}
+    chosen = (camera, "velodyne_points")
+    frames = sorted(set().union(*(numbers[sensor] for sensor in chosen)))
+    few = {sensor for sensor in chosen if numbers[sensor]
+           and not runs.has_files(np.array([frame in numbers[sensor] for frame in frames]))}
+    for sensor in sorted(few):
+        warnings.warn(f"{folder}: only {len(numbers[sensor])} of {len(frames)} frames have a file in {sensor}, which "
+                      f"is not used. Copy the others, or remove it.", schema.DataWarning, stacklevel=3)
+    return {sensor for sensor, there in numbers.items() if there} - few
+
+
 def _usual(sensor: str, frame_id: int) -> str:
     """As KITTI names it."""
     return f"{frame_id:010d}{_SUFFIXES.get(sensor, _IMAGE_SUFFIXES)[0]}"
@@ -244,9 +260,12 @@ def _shared_sensors(every: dict[pathlib.Path, set[str]], camera: str) -> tuple[s
     return (*shared, "oxts")
 
 
-def _lacking(folder: pathlib.Path, sensors: tuple[str, ...]) -> schema.DataError:
+def _lacking(folder: pathlib.Path, sensors: tuple[str, ...], there: set[str]) -> schema.DataError:
     """What the first missing sensor of a drive should have been."""
-    sensor = next(name for name in sensors if not _files(folder, name))
+    sensor = next(name for name in sensors if name not in there)
+    if _files(folder, sensor):
+        return schema.DataError(f"{folder / sensor / 'data'}: too few files, expected the {sensor} frames of the drive "
+                                f"(unpack the synced drive).")
     return files.missing(folder / sensor / "data" / _usual(sensor, 0),
                          f"the {sensor} frames of the drive (unpack the synced drive)")
 

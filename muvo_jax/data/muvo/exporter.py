@@ -8,8 +8,9 @@
 The plain format knows no expert's policy, no satellite position and no bird's-eye view of other cars: those columns are
 zeros, as an autopilot leaves them, and the birdview is background throughout. The weather's name is that of frames.csv,
 the town's the one that a run's name begins with, as in record_carla's (Town01_003). Frames without a recorded reward
-get 1, lest the authors' filter drop the run. Voxels are written where the recorded grid is the authors'; else make them
-from depth and lidar afterwards. Nothing here needs pandas.
+get 1, lest the authors' filter drop the run. Where a run has no yaw rate, gyroscopes are zeros, and sensors.toml says
+yaw_rate = false, by which our reader leaves them out. Voxels are written where the recorded grid is the authors'; else
+make them from depth and lidar afterwards. Nothing here needs pandas.
 """
 
 from __future__ import annotations
@@ -19,12 +20,13 @@ import io
 import pathlib
 import re
 import shutil
+import warnings
 from collections.abc import Callable, Iterator
 
 import numpy as np
 from PIL import Image
 
-from muvo_jax.data import description, fields, files, fingerprints, schema, sequences
+from muvo_jax.data import description, fields, files, fingerprints, processes, schema, sequences
 from muvo_jax.data.muvo import files as muvo_files
 from muvo_jax.data.muvo import frame_pickle
 from muvo_jax.data.muvo import reader as muvo_reader
@@ -40,6 +42,7 @@ _COMMAND_FOLLOW = 4
 _BACKGROUND = 1  # bit 0
 _NO_WEATHER = "ClearNoon"  # where none is recorded
 RUNS_FILE = "runs.csv"
+_LOCK_FILE = ".exporting"
 _COLUMNS = ("mode", "town", "run", "recording", "source", "first_frame", "frames", "fingerprint")
 _TOWN = re.compile(r"(Town\d+\w*?)(?:_|$)")
 _LABELS = frozenset({"depth_m", "image_classes", "point_classes"})
@@ -64,23 +67,26 @@ def export(source: pathlib.Path | str, out: pathlib.Path | str, *, town: str = "
       DataError: where the source lacks what the authors' reader always opens, or a file is damaged.
       FileExistsError: where `out` holds an export of other sensors or another recording, or of this one as it was
         before its files were changed.
+      BlockingIOError: where another process exports into `out`.
     """
     source, out = pathlib.Path(source).expanduser(), pathlib.Path(out).expanduser()
     if not re.fullmatch(r"Town\w+", town):
         raise ValueError(f"--town={town}: expected a name such as Town01; the authors' code looks for those.")
     recording = plain_reader.PlainRecording(source, labels=_LABELS)
     _check(recording, source)
-    _describe(recording.description, out)
     runs = _plan(recording, town)
-    _keep_table(source, out, recording, runs)
     total, written = sum(sequence.length for _, sequence in runs), 0
-    for folder, sequence in runs:
-        target = out / muvo_runs.VERSION_FOLDER / folder
-        if not (target / muvo_runs.FRAME_FILE).is_file():
-            for _ in _write_run(recording, sequence, target):
-                written += 1
-                if progress is not None:
-                    progress(written, total)
+    out.mkdir(parents=True, exist_ok=True)
+    with processes.locked(out / _LOCK_FILE, "exporting"):
+        _describe(recording, out)
+        _keep_table(source, out, recording, runs)
+        for folder, sequence in runs:
+            target = out / muvo_runs.VERSION_FOLDER / folder
+            if not (target / muvo_runs.FRAME_FILE).is_file():
+                for _ in _write_run(recording, sequence, target):
+                    written += 1
+                    if progress is not None:
+                        progress(written, total)
     return written
 
 
@@ -95,13 +101,19 @@ def _check(recording: plain_reader.PlainRecording, source: pathlib.Path) -> None
                                f"map; this recording has no {', '.join(lacking)}.")
 
 
-def _describe(described: schema.RecordingDescription, out: pathlib.Path) -> None:
+def _describe(recording: plain_reader.PlainRecording, out: pathlib.Path) -> None:
+    described = recording.description
+    has_yaw = "yaw_rate_radps" in sequences.in_every_frame(recording)
+    if not has_yaw:
+        warnings.warn(f"{described.name}: not every run has yaw_rate_radps or yaw_rad: gyroscopes of the export are "
+                      f"zeros there, as of a car that never turns. Our reader leaves yaw rate and pose out, the "
+                      f"authors' code cannot know it.", schema.DataWarning, stacklevel=3)
     voxels = described.voxels if described.voxels == muvo_reader.VOXELS else None
     route_map = described.route_map if described.route_map != muvo_reader.ROUTE_MAP else None
-    files.write_description(out / muvo_reader.SENSORS_FILE, {
-        "rate_hz": described.rate_hz, "tags": muvo_tags.OLDER} | description.tables(
-            camera=described.camera, lidar=described.lidar, action=described.contract, voxels=voxels,
-            route_map=route_map), "other sensors")
+    said = {"rate_hz": described.rate_hz, "tags": muvo_tags.OLDER} | ({} if has_yaw else {"yaw_rate": False})
+    files.write_description(out / muvo_reader.SENSORS_FILE, said | description.tables(
+        camera=described.camera, lidar=described.lidar, action=described.contract, voxels=voxels,
+        route_map=route_map), "other sensors")
 
 
 def _plan(recording: plain_reader.PlainRecording, town: str) -> list[tuple[str, schema.Sequence]]:

@@ -2,8 +2,8 @@
 
     ROOT/trainval/<mode>/<Town>/<run>/pd_dataframe.pkl    one row a frame, paths relative to the run (runs.py)
     ROOT/trainval/<mode>/<Town>/<run>/occupancy/*.npz     ours, optional: muvo_jax.voxelize separates empty and unknown
-    ROOT/sensors.toml                                     ours, optional: rate_hz, tags, and the sections [camera],
-                                                          [lidar], [voxels], [action], [route_map]
+    ROOT/sensors.toml                                     ours, optional: rate_hz, tags, yaw_rate, and the sections
+                                                          [camera], [lidar], [voxels], [action], [route_map]
 
 The path may also be the version's folder (trainval), a mode's (train), a town's or a run's. Modes are the splits; where
 there is no mode above the towns, all is "train". The layout does not say how the sensors are mounted: without
@@ -73,6 +73,8 @@ class MuvoRecording:
         header, sensors_path = read_sensors(path)
         rate_hz = description.rate_hz(header, sensors_path) if "rate_hz" in header else RATE_HZ
         every = muvo_runs.find_runs(path)
+        if not header.get("yaw_rate", True):
+            every = [_without_imu(run) for run in every]
         _check_names(every, path)
         kept = [run for run in every if run.frames and not run.mean_reward < min_mean_reward]
         if not kept:
@@ -244,7 +246,10 @@ def read_sensors(path: pathlib.Path) -> tuple[dict, pathlib.Path]:
     found = next((folder / SENSORS_FILE for folder in above if (folder / SENSORS_FILE).is_file()), None)
     header = files.read_toml(found) if found is not None else {}
     found = found or path / SENSORS_FILE
-    description.check_names(header, found, ("rate_hz", "tags"))
+    description.check_names(header, found, ("rate_hz", "tags", "yaw_rate"))
+    if not isinstance(header.get("yaw_rate", True), bool):
+        raise schema.DataError(f"{found}: yaw_rate is {header['yaw_rate']!r}, expected false where the gyroscopes of "
+                               f"the runs measured nothing, else true.")
     return header, found
 
 
@@ -314,6 +319,10 @@ def _warn_of_steps(kept: list[muvo_runs.Run]) -> None:
 def occupancy_names(run: muvo_runs.Run) -> muvo_runs.NumberedNames:
     """Paths of the frames' occupancy, relative to the run; by their numbers, since rows may be taken out later."""
     return muvo_runs.NumberedNames(f"{OCCUPANCY_FOLDER}/{OCCUPANCY_FOLDER}_", muvo_runs.numbering(run), 9, ".npz")
+
+
+def _without_imu(run: muvo_runs.Run) -> muvo_runs.Run:
+    return dataclasses.replace(run, columns={name: cells for name, cells in run.columns.items() if name != "imu"})
 
 
 def _with_occupancy(run: muvo_runs.Run) -> muvo_runs.Run:

@@ -8,6 +8,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from muvo_jax.data import fields, schema
+from muvo_jax.data.plain import frames_table
 
 FIELDS = tuple(fields.FIELDS[name] for name in ("intrinsics", "camera_to_ego"))
 
@@ -45,4 +46,4 @@ def check(columns: Mapping[str, np.ndarray], described: schema.Camera, path: pat
             frame = of_frame(columns, row, described)
             schema.Camera.of(described.width_px, described.height_px, frame["intrinsics"], frame["camera_to_ego"])
         except ValueError as error:
-            raise schema.DataError(f"{path}, line {row + 2}: {error}") from error
+            raise schema.DataError(f"{path}, line {frames_table.line_of(path, row)}: {error}") from error

@@ -47,6 +47,11 @@ def words(path: pathlib.Path, column: str) -> list[str]:
     return [row[header.index(column)] for row in rows] if column in header else []
 
 
+def line_of(path: pathlib.Path, row: int) -> int:
+    """The line of the file that a row of its columns stands in. Raises DataError for a malformed table."""
+    return _cells(path)[2][row]
+
+
 def ends_with_a_line(path: pathlib.Path) -> bool:
     """Whether the last row of a table ends, as every writer of CSV ends it; editors may not."""
     return path.read_bytes().endswith((b"\n", b"\r"))

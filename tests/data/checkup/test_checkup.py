@@ -61,6 +61,17 @@ def test_accelerations_of_another_scale_are_found():
     assert any("0.30 times what the action contract says" in text for text in problems(drive(), other))
 
 
+def test_steering_of_another_scale_is_found():
+    of_the_steering_wheel = dataclasses.replace(CONTRACT, steer_full_rad=CONTRACT.steer_full_rad / 10)
+    (found,) = problems(drive(), of_the_steering_wheel)
+    assert re.search(r"the car turns 1\d\.\d+ times as fast as the action contract says; correct steer_full_rad", found)
+    degrees = np.degrees(drive().yaw_rate_radps)
+    (found,) = problems(drive(yaw_rate_radps=degrees))
+    assert "is yaw_rate_radps in degrees per second?" in found
+    assert problems(driven(yaw_rate_radps=degrees)) == []  # named by of_units, which knows better
+    assert problems(drive(), dataclasses.replace(of_the_steering_wheel, kinematics="none")) == []
+
+
 @pytest.mark.parametrize(("times_s", "message"), [
     (np.arange(100) / 5, "0.200 s apart, but the description says 10 Hz"),
     (np.where(np.arange(100) == 7, 0.6, np.arange(100) / 10), "time does not advance at 1 of 98"),
@@ -198,6 +209,9 @@ def driven(**changes):
     (lambda motion: {"speed_mps": motion.speed_mps * 3.6}, r"speed_mps is 3\.\d+ times .*km/h"),
     (lambda motion: {"pose": motion.pose * [1000, 1000, 1]}, r"speed_mps is 0\.00 times .*km/s"),
     (lambda motion: {"pose": motion.pose * [1, 1, 57.2958]}, "must be in radians"),
+    (lambda motion: {"yaw_rate_radps": np.degrees(motion.yaw_rate_radps)},
+     r"yaw_rate_radps is 5\d\.\d+ times what yaw turns .* \(degrees\?\)"),
+    (lambda motion: {"yaw_rate_radps": -motion.yaw_rate_radps}, r"yaw_rate_radps is -1\.\d+ times what yaw"),
 ])
 def test_units_are_compared_with_the_motion(change, message):
     motion = driven()
@@ -238,3 +252,64 @@ def test_nothing_to_look_at_is_a_problem(tmp_path):
     empty = types.SimpleNamespace(sequences=(), description=described)
     assert any("not one frame" in finding.text and finding.level == "problem"
                for finding in examination.examine(empty).findings)
+
+
+AHEAD = np.array(camera_ops.level_camera_to_ego((1.5, 0.0, 1.6)), np.float64)
+MIDDLE = np.array([[60.0, 0.0, 48.0], [0.0, 60.0, 32.0], [0.0, 0.0, 1.0]])
+
+
+def pitched(degrees):
+    """The camera, looking down by so much."""
+    pose = AHEAD.copy()
+    pose[:3, :3] = street_scene.turn(0.0, np.radians(degrees)) @ pose[:3, :3]
+    return pose
+
+
+@pytest.mark.parametrize(("pose", "intrinsics", "level", "message"), [
+    (AHEAD, MIDDLE, None, None),
+    (pitched(30.0), MIDDLE, None, None),
+    (np.eye(4), MIDDLE, "problem", r"down axis, .* is \(0\.00, 1\.00, 0\.00\) in the ego frame"),
+    (np.linalg.inv(AHEAD), MIDDLE, "problem", "down axis, .*is camera_to_ego inverted"),
+    (pitched(50.0), MIDDLE, "problem", "the camera looks 50 degrees down"),
+    (np.diag([-1.0, -1.0, 1.0, 1.0]) @ AHEAD, MIDDLE, "remark", "looks backwards"),
+    (AHEAD, MIDDLE * [[1, 1, 2.2], [1, 1, 1], [1, 1, 1]], "problem", "cx = 105.6 lies outside of 96 pixels"),
+    (AHEAD, MIDDLE * [[1, 1, 1], [1, 1, 0.3], [1, 1, 1]], "remark", "cy = 9.6 lies far from the middle of 64 pixels"),
+])
+def test_cameras_that_no_car_has_are_found(pose, intrinsics, level, message):
+    found = judgements.of_cameras([(intrinsics, pose)] * 2, 96, 64)
+    assert [finding.level for finding in found] == [level] * (level is not None)
+    assert all(re.search(message, finding.text) for finding in found)
+
+
+def street(seed, **changes):
+    """A frame of the street with the depth of what the scan hits, else infinite."""
+    frame = street_scene.frame(seed, 32)
+    place_px, ahead_m = camera_ops.project_to_image(frame["points_m"], frame["intrinsics"], frame["camera_to_ego"])
+    height_px, width_px = frame["image"].shape[:2]
+    depth_m = np.full((height_px, width_px), np.inf, np.float32)
+    inside = ((place_px >= 0) & (place_px < [width_px, height_px])).all(axis=1)
+    column, row = place_px[inside].astype(int).T
+    depth_m[row, column] = ahead_m[inside]
+    return frame | {"frame_id": seed, "speed_mps": 8.0, "depth_m": depth_m} | changes
+
+
+@pytest.mark.parametrize(("change", "level", "message"), [
+    (lambda frame: {}, None, None),
+    (lambda frame: {"depth_m": frame["depth_m"] * 10}, "problem", r"depth_m is 10 times .*written in millimetres\?"),
+    (lambda frame: {"depth_m": frame["depth_m"] / 100}, "problem", r"depth_m is 0\.01 times .*written in metres\?"),
+    (lambda frame: {"depth_m": np.where(np.arange(frame["depth_m"].shape[1]) % 4, frame["depth_m"], 0)}, "remark",
+     r"depth is 0 in 25% of the pixels: they count as not measured"),
+    (lambda frame: {"points_m": street(0)["points_m"]}, "problem", r"2 of 3 scans are copies of the one before"),
+    (lambda frame: {"points_m": street(0)["points_m"], "speed_mps": 0.0}, None, None),
+    (lambda frame: {"points_m": frame["points_m"][frame["points_m"][:, 0] > 0] * np.float32([-1, -1, 1])}, "problem",
+     "hardly a return of the lidar falls into the picture"),
+])
+def test_scans_are_compared_with_depth_the_picture_and_the_scan_before(tmp_path, change, level, message):
+    described = plain_reader.PlainRecording(writers.write_plain(tmp_path / "rec")).description
+    counted = figures.Figures(dataclasses.replace(described, lidar=street_scene.lidar(32)))
+    for seed in range(3):
+        counted.add(street(seed, **change(street(seed))))
+    about = [finding for finding in counted.findings()
+             if re.search("depth|copies|falls into", finding.text)]
+    assert [finding.level for finding in about] == [level] * (level is not None), about
+    assert all(re.search(message, finding.text) for finding in about)

@@ -163,3 +163,19 @@ def test_a_drive_of_another_rate_is_warned_of(tmp_path):
     told = rf"{whole.name}: frames follow each other after 0\.1 s, .* after 0\.2 s"
     with pytest.warns(schema.DataWarning, match=told):
         sources.open_recording(tmp_path)
+
+
+def test_a_few_pictures_take_no_scan_away(tmp_path):
+    drive = writers.write_kitti(tmp_path)
+    whole = drive.with_name("2011_09_26_drive_0100_sync")
+    shutil.copytree(drive, whole)
+    for path in sorted((drive / "image_02/data").iterdir())[1:]:
+        path.unlink()
+    shutil.copy(drive / "image_02/timestamps.txt", drive / "velodyne_points")
+    with pytest.warns(schema.DataWarning, match=r"only 1 of 12 frames have a file in image_02, which is not used"):
+        recording = sources.open_recording(drive)
+    assert sum(sequence.length for sequence in recording.sequences) == 12 and recording.description.camera is None
+    with (pytest.warns(schema.DataWarning, match="only 1 of 12 frames"),
+          pytest.warns(schema.DataWarning, match=r"image_02/data: too few files, .* The drive is left out")):
+        recording = sources.open_recording(tmp_path)
+    assert {sequence.name for sequence in recording.sequences} == {whole.name}

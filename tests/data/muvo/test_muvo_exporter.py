@@ -8,7 +8,7 @@ import recording_samples as samples
 import recording_writers as writers
 
 from muvo_jax import config as config_lib
-from muvo_jax.data import fields, schema, sources
+from muvo_jax.data import fields, processes, schema, sources
 from muvo_jax.data.muvo import exporter as muvo_exporter
 from muvo_jax.data.muvo import files as muvo_files
 from muvo_jax.data.muvo import reader as muvo_reader
@@ -137,6 +137,29 @@ def test_a_source_that_was_changed_makes_no_half_new_export(source, tmp_path):
     shutil.rmtree(changed / "val_rl/b")
     with pytest.raises(FileExistsError, match=r"val0/Town01/0000 was made of .* would now be no run of this recording"):
         muvo_exporter.export(changed, out)
+
+
+def test_a_yaw_that_nobody_recorded_is_not_read_as_straight_ahead(source, tmp_path):
+    still = shutil.copytree(source, tmp_path / "source")
+    for table in still.glob("*/*/frames.csv"):
+        table.write_text(table.read_text().replace("yaw_rad", "other_rad").replace("yaw_rate_radps", "other_radps"))
+    with pytest.warns(schema.DataWarning, match="not every run has yaw_rate_radps .* export are zeros there"):
+        muvo_exporter.export(still, tmp_path / "out")
+    recording = sources.open_recording(tmp_path / "out")
+    frame = recording.read(recording.sequences[0], 0)
+    assert not {"yaw_rate_radps", "pose"} & (recording.description.modalities | frame.keys())
+    described = tmp_path / "out" / muvo_reader.SENSORS_FILE
+    described.write_text(described.read_text().replace("yaw_rate = false", "yaw_rate = 0"))
+    with pytest.raises(schema.DataError, match=r"sensors\.toml: yaw_rate is 0, expected false"):
+        sources.open_recording(tmp_path / "out")
+
+
+def test_a_second_export_into_one_folder_is_told(source, tmp_path):
+    pytest.importorskip("fcntl")
+    with (processes.locked(tmp_path / ".exporting", "exporting"),
+          pytest.raises(BlockingIOError, match="another process is exporting here now")):
+        muvo_exporter.export(source, tmp_path)
+    assert [path.name for path in tmp_path.iterdir()] == [".exporting"]
 
 
 def test_what_the_authors_reader_needs_is_asked_for(tmp_path):

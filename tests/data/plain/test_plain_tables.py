@@ -189,3 +189,13 @@ def test_a_description_and_a_table_that_cannot_be_read_are_named(tmp_path):
     (root / "recording.toml").mkdir()
     with pytest.raises(schema.DataError, match=r"recording\.toml: expected a TOML description, but it cannot be read"):
         plain_reader.read_header(root)
+
+
+def test_a_camera_that_cannot_be_is_named_by_its_line(tmp_path):
+    root = writers.write_plain(tmp_path, {"train/a": 3})
+    header, *rows = table(root, "train/a").read_text().splitlines()
+    columns = ",".join(f"intrinsics_{row}{column}" for row in (1, 2) for column in (1, 2, 3))
+    rows = [f"{row},{focal_px},0,32,0,32,16" for row, focal_px in zip(rows, (32, -32, 32), strict=True)]
+    table(root, "train/a").write_text("\n".join([f"{header},{columns}", "", "", *rows]) + "\n")
+    with pytest.raises(schema.DataError, match=r"frames\.csv, line 5: .* fx = -32"):
+        plain_reader.PlainRecording(root)

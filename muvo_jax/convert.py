@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import errno
 import json
+import os
 import pathlib
 import shutil
 import sys
@@ -51,8 +53,13 @@ def convert(options: Options, show: screen.Screen) -> checkpoints.Stored:
     Raises:
       FileExistsError: where the run's folder is not empty.
       OSError: where the run cannot be written.
-      ValueError: where the file cannot be read, is of another project, or does not fit; no folder is left behind.
+      ValueError: where the run's folder is the current one; where the file cannot be read, is of another project, or
+        does not fit; no folder is left behind.
     """
+    options = dataclasses.replace(options, out=options.out.expanduser().resolve())
+    if options.out in (here := pathlib.Path.cwd(), *here.parents):
+        raise ValueError(f"--out is {options.out}, the current folder or one around it; expected a folder of the run's "
+                         f"own, such as --out=runs/NAME.")
     if options.out.exists() and not (options.out.is_dir() and not any(options.out.iterdir())):
         raise FileExistsError(f"{options.out} exists already: choose another --out.")
     stored = checkpoints.read(options.checkpoint)
@@ -93,8 +100,14 @@ def _write(out: pathlib.Path, step: int, variables: Any, config: config_lib.Conf
         with contextlib.suppress(OSError):
             for parent in absent:
                 parent.rmdir()
-        raise OSError(f"the run could not be written to {out}: {screen.said(error)}. Is the disk full? Nothing was "
-                      f"left behind.") from error
+        raise OSError(f"the run could not be written to {out}: {screen.said(error)}."
+                      + (" Is the disk full?" if _of_disk(error) else "") + " Nothing was left behind.") from error
+
+
+def _of_disk(error: Exception) -> bool:
+    """Whether there was no room: TensorStore tells it in words alone."""
+    full = (errno.ENOSPC, errno.EDQUOT)
+    return getattr(error, "errno", None) in full or any(os.strerror(code) in str(error) for code in full)
 
 
 def _write_whole(out: pathlib.Path, step: int, variables: Any, config: config_lib.Config,

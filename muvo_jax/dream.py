@@ -22,9 +22,10 @@ with late.imports():
     from muvo_jax.data import prepare as prepare_lib
     from muvo_jax.metrics import baselines, protocol, warp
     from muvo_jax.model import rollout, world_model
-    from muvo_jax.training import screen
+    from muvo_jax.training import run_folder, screen
     from muvo_jax.viz import page, rerun_log, sheets
 
+DREAMS_FOLDER = "dreams"
 MOST_COLUMNS = 3  # predictions beside the truth in one animation
 
 
@@ -77,11 +78,13 @@ def dream(options: Options, show: screen.Screen) -> list[pathlib.Path]:
 
     Raises:
       ValueError: for a run whose heads show nothing, before any data is opened; for options that do not fit.
+      OSError: where the dream cannot be written, before any data is opened.
     """
     loaded = command_line.load_run(options.run, options.checkpoint, show)
     evaluate.check_shown(loaded, "a dream")
     if options.rerun:
         rerun_log.check(options.rerun)
+    run_folder.check_writable(options.out or loaded.folder / DREAMS_FOLDER, "--out" if options.out else "RUN")
     for flag, value in (("branches", options.branches), ("moments", options.moments)):
         if value < 1:
             raise ValueError(f"--{flag} is {value}; it must be at least 1.")
@@ -107,7 +110,7 @@ def draw(options: Options, config: config_lib.Config, batch: types.Batch, views:
     """Everything that shows the first window of a batch and its futures; returns the files written."""
     truth, actions = sheets.views_of_batch(batch, 0), np.asarray(batch.action[0])
     scene, context, beside = sheets.Scene.of(config), config.data.context, moved_views(batch, config)
-    sequence, out = window.sequence, options.out or folder / "dreams"
+    sequence, out = window.sequence, options.out or folder / DREAMS_FOLDER
     name = f"{sequence.split}_{sequence.name.rpartition('/')[2]}_{window.start:04d}"
     title = f"{model_name}   {sequence.name} from frame {window.start}"
     few = {label: views[label] for label in list(views)[:MOST_COLUMNS]}

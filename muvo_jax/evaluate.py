@@ -27,7 +27,7 @@ with late.imports():
     from muvo_jax.data import fitting, pipeline, schema, sequences, windows
     from muvo_jax.metrics import baselines, cards, protocol, warp
     from muvo_jax.model import world_model
-    from muvo_jax.training import checkpoint_meta, screen, validation
+    from muvo_jax.training import checkpoint_meta, run_folder, screen, validation
     from muvo_jax.viz import rerun_log, sheets
 
 
@@ -81,7 +81,12 @@ python -m muvo_jax.evaluate runs/town-tr --context=8 --horizon=10 --checkpoint=b
 
 
 def evaluate(options: Options, show: screen.Screen) -> dict[str, Any]:
-    """Does what the command line asks for; returns what evaluation.json holds."""
+    """Does what the command line asks for; returns what evaluation.json holds.
+
+    Raises:
+      ValueError: for options that do not fit the run or the recording.
+      OSError: where the run's folder cannot be written, before anything is judged.
+    """
     card = cards.load(options.card) if options.card else None
     loaded = command_line.load_run(options.run, options.checkpoint, show)
     fields = {"data": "data.path", "context": "data.context", "horizon": "data.horizon",
@@ -91,6 +96,7 @@ def evaluate(options: Options, show: screen.Screen) -> dict[str, Any]:
         raise ValueError(f"--uncertainty is {options.uncertainty}; expected two futures or more, or 0 for none.")
     if options.rerun:
         check_shown(loaded, "--rerun")
+    run_folder.check_writable(loaded.folder, "RUN")
     log = rerun_log.RerunLog(options.rerun) if options.rerun else None
     chosen = command_line.chosen_settings(options, fields)
     config = config_lib.override_all(loaded.config, chosen)
@@ -132,13 +138,27 @@ def evaluate(options: Options, show: screen.Screen) -> dict[str, Any]:
         show.line(evaluation_report.answers_line(scores["action_shuffle"]))
     suffix = f"-{pathlib.Path(card.name).stem}" if card else ""
     suffix += f"-on-{_in_a_name(recording.description.name, config.data.path)}" if options.data else ""
-    written = evaluation_report.write_report(loaded.folder, report, suffix)
+    written = _write(loaded.folder, report, suffix, show)
     if options.uncertainty:
         written += (evaluation_report.draw_uncertainty(loaded.folder / f"uncertainty{suffix}.png", report),)
     written += (log.close(),) if log else ()
     for path in written:
         show.line(f"wrote {path}")
     return report
+
+
+def _write(folder: pathlib.Path, report: dict[str, Any], suffix: str, show: screen.Screen) -> tuple[pathlib.Path, ...]:
+    """Writes the report; shows it where that fails, for judging took long.
+
+    Raises:
+      OSError: where it cannot be written.
+    """
+    try:
+        return evaluation_report.write_report(folder, report, suffix)
+    except OSError as error:
+        show.line(evaluation_report.markdown(report))
+        raise OSError(f"the report could not be written to {folder} ({error.strerror or error}), and stands above "
+                      f"instead.") from error
 
 
 def check_shown(loaded: run_lib.Run, what: str) -> None:

@@ -33,7 +33,7 @@ with late.imports():
     from muvo_jax.model import live as live_lib
     from muvo_jax.model import memory as memory_lib
     from muvo_jax.model import rollout, world_model
-    from muvo_jax.training import screen
+    from muvo_jax.training import run_folder, screen
 
 PLATFORMS = ("cpu", "cuda")
 SIGNATURES = "signatures.json"
@@ -67,12 +67,16 @@ def export(options: Options, show: screen.Screen) -> list[pathlib.Path]:
     """Does what the command line asks for; returns the files written.
 
     Raises:
-      ValueError: if OUT holds something, the horizon is below 1, or a library of the extra is missing.
+      ValueError: if OUT is a file or holds something, the horizon is below 1, or a library of the extra is missing.
+      OSError: if OUT cannot be written.
     """
     if importlib.util.find_spec("flatbuffers") is None:
         raise ValueError("export needs flatbuffers: pip install 'muvo_jax[export]'")
+    if options.out.exists() and not options.out.is_dir():
+        raise ValueError(f"OUT: {options.out} is a file; name a new folder.")
     if options.out.exists() and any(options.out.iterdir()):
         raise ValueError(f"OUT: {options.out} is not empty; name a new folder.")
+    run_folder.check_writable(options.out, "OUT")
     loaded = command_line.load_run(options.run, options.checkpoint, show)
     horizon = loaded.config.data.horizon if options.horizon is None else options.horizon
     written = seal(loaded.model, loaded.variables, loaded.config, options.out, horizon=horizon)

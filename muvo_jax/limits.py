@@ -6,7 +6,7 @@
     def __post_init__(self):
         limits.check(self)
 
-Every float must be finite, with a range or without.
+Every float must be finite, with a range or without, and so in float32, in which a model computes.
 """
 
 from __future__ import annotations
@@ -18,6 +18,9 @@ import numbers
 import types
 import typing
 from typing import Any
+
+# The ends of float32. A device takes what is smaller for 0.
+_LARGEST, _SMALLEST = (2.0 - 2.0**-23) * 2.0**127, 2.0**-126
 
 
 @dataclasses.dataclass(frozen=True)
@@ -37,10 +40,11 @@ class Limits:
     unit: str = ""
 
     def holds(self, value: float) -> bool:
-        """Whether a finite number lies inside; NaN never does."""
+        """Whether a number that is finite in float32 lies inside, there too where 0 does not; NaN never does."""
         above = value > self.lowest if self.open_low else value >= self.lowest
         below = value < self.highest if self.open_high else value <= self.highest
-        return bool(above and below and math.isfinite(value))
+        vanishes = self.open_low and self.lowest == 0 and abs(value) < _SMALLEST
+        return bool(above and below and abs(value) <= _LARGEST and not vanishes)
 
     def __str__(self) -> str:
         unit = f" {self.unit}" if self.unit else ""
@@ -100,7 +104,7 @@ def check(instance: Any) -> None:
                 kind = "whole numbers" if whole else "numbers"
                 raise RangeError(cls.__name__, name, f"is {value!r}; expected {kind}.")
             if not _holds(limits, number):
-                raise RangeError(cls.__name__, name, f"is {value!r}; it must be {limits}.")
+                raise RangeError(cls.__name__, name, f"is {value!r}{_in_float32(number)}; it must be {limits}.")
 
 
 def _holds(limits: Limits, number: Any) -> bool:
@@ -108,6 +112,13 @@ def _holds(limits: Limits, number: Any) -> bool:
         return limits.holds(float(number))
     except OverflowError:  # a whole number that no float can be
         return False
+
+
+def _in_float32(number: Any) -> str:
+    """What float32 makes of a number that it does not hold; "" of others."""
+    if math.inf > abs(number) > _LARGEST:
+        return " (infinite in float32)"
+    return " (0 in float32)" if 0 < abs(number) < _SMALLEST else ""
 
 
 def _numbers(value: Any) -> typing.Iterator[Any]:

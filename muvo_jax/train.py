@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import os
 import pathlib
 import shlex
 import sys
@@ -35,6 +36,7 @@ with late.imports():
     from muvo_jax.viz import curves, sheets
 
 PERCEPTUAL_WEIGHT = 0.1  # the reference's
+_LONGEST_NAME = 255  # bytes of a file's or a folder's, on every usual file system
 # Flags that change one field of the configuration.
 _FIELDS = {"lidar": "model.lidar", "camera": "model.camera", "fusion": "model.fusion", "latent": "model.latent",
            "backbone": "model.backbone", "data": "data.path", "data_camera": "data.camera", "workers": "data.workers",
@@ -156,8 +158,9 @@ def configure(options: Options) -> tuple[config_lib.Config, dict[str, Any], path
     """Returns the config, the settings that the user chose by dotted name, and the run's folder.
 
     Raises:
-      ValueError: for an unknown setting or a value of the wrong type; for flags and settings that contradict each
-        other; for another preset than that of the resumed run, or another network than that of the run to start from.
+      ValueError: for an unknown setting or a value of the wrong type; for a name that is none; for flags and settings
+        that contradict each other; for another preset than that of the resumed run, or another network than that of
+        the run to start from.
       FileNotFoundError, CheckpointError: where there is no run to resume or to start from.
     """
     if options.resume and options.init:
@@ -167,9 +170,8 @@ def configure(options: Options) -> tuple[config_lib.Config, dict[str, Any], path
     choices.check(options, settings, _FIELDS)
     chosen = (choices.of_variant(options, settings) | _network_settings(options, settings)
               | command_line.chosen_settings(options, _FIELDS) | settings)
-    base = presets.get(options.preset or "town")
+    base, folder = presets.get(options.preset or "town"), options.runs_dir / run_name(options)
     started = checkpoint.load_run(options.init) if options.init else None
-    folder = options.runs_dir / run_name(options)
     if options.resume:
         base = run_folder.read_config(folder)
         if options.preset not in (None, base.preset):
@@ -247,8 +249,22 @@ def frozen_encoder(config: config_lib.Config) -> perceptual.FrozenEncoder | None
 
 
 def run_name(options: Options) -> str:
-    """That of the run's folder in RUNS_DIR; it may lie in folders there, as a/b does."""
-    return options.name or default_name(_in_lower_case(options))
+    """That of the run's folder in RUNS_DIR; it may lie in folders there, as a/b does.
+
+    Raises:
+      ValueError: for one that leads elsewhere, or that no folder can have.
+    """
+    name = options.name or default_name(_in_lower_case(options))
+    parts, problem = pathlib.PurePath(name).parts, None
+    if name.startswith(("~", "/")):
+        problem = f"it is a path; give --runs-dir={name} and a name"
+    elif not name.strip() or not parts or ".." in parts:
+        problem = "it leads out of that folder, or to the folder itself"
+    elif "\0" in name or any(len(os.fsencode(part)) > _LONGEST_NAME for part in parts):
+        problem = f"no folder can be called so (up to {_LONGEST_NAME} bytes, none of them 0)"
+    if problem:
+        raise ValueError(f"--name is a name inside --runs-dir ({options.runs_dir}); got {name!r:.100}: {problem}.")
+    return name
 
 
 def _in_lower_case(options: Options) -> Options:

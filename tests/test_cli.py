@@ -251,6 +251,18 @@ def test_what_has_many_values_by_default_may_be_given_again_and_again():
     assert given[0].towns == ("Town01", "Town02")
 
 
+@pytest.mark.parametrize("name, problem", [
+    ("~/x", r"got '~/x': it is a path; give --runs-dir=~/x and a name"),
+    ("/tmp/x", "it is a path; give --runs-dir=/tmp/x"),
+    (".", "it leads out of that folder, or to the folder itself"), ("..", "leads out"), ("a/../../b", "leads out"),
+    ("a\0b", "no folder can be called so"), ("x" * 256, "no folder can be called so"),
+    ("\u00e9" * 128, "up to 255 bytes")])
+def test_a_name_is_one_inside_the_folder_of_runs(name, problem):
+    with pytest.raises(ValueError, match=rf"--name is a name inside --runs-dir \(runs\); .*{problem}"):
+        train.configure(train.Options(preset="tiny", name=name))
+    assert train.configure(train.Options(preset="tiny", name="a/b"))[2] == pathlib.Path("runs/a/b")
+
+
 def test_default_names_tell_runs_apart():
     names = [train.default_name(options) for options in (
         train.Options(), train.Options(preset="paper", fusion="tr"), train.Options(data="/data/kitti_raw"),

@@ -213,6 +213,23 @@ def test_every_weight_rate_and_probability_has_a_range():
     assert unlimited == set()
 
 
+@pytest.mark.parametrize("heads", [(), ("image", "action", "image")])
+def test_a_model_has_heads_and_each_once(heads):
+    with pytest.raises(ValueError, match=r"model\.heads is \(.*; expected one or more heads, each once, of image"):
+        dataclasses.replace(presets.get("tiny").model, heads=heads)
+
+
+@pytest.mark.parametrize("field, value, message", [
+    ("optimizer.epsilon", 1e-60, r"epsilon is 1e-60 \(0 in float32\); it must be above 0"),
+    ("optimizer.epsilon", 1e-39, r"epsilon is 1e-39 \(0 in float32\); it must be above 0"),
+    ("augmentation.blur_std_px", (1e-50, 1.0), r"blur_std_px is \(1e-50, 1.0\) \(0 in float32\)"),
+    ("loss.kl", 1e39, r"kl is 1e\+39 \(infinite in float32\)"),
+])
+def test_numbers_must_hold_in_float32(field, value, message):
+    with pytest.raises(ValueError, match=message):
+        config_lib.override(presets.get("tiny"), field, value)
+
+
 def test_geometry_says_what_is_wrong_in_its_own_words():
     with pytest.raises(ValueError, match=r"elevation_min_rad is 0.2; it must be below elevation_max_rad, 0.1"):
         config_lib.RangeViewGeometry(elevation_min_rad=0.2, elevation_max_rad=0.1)

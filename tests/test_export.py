@@ -14,6 +14,7 @@ import pytest
 from muvo_jax import config as config_lib
 from muvo_jax import export, presets
 from muvo_jax.model import live, rollout, world_model
+from muvo_jax.training import screen
 
 PROGRAM = """
 import json, pathlib, sys
@@ -95,3 +96,12 @@ def test_a_horizon_of_nothing_is_refused(tmp_path):
     pytest.importorskip("safetensors", reason="safetensors (extra [export]) is not installed")
     with pytest.raises(ValueError, match="horizon is 0"):
         export.seal(world_model.WorldModel(presets.get("tiny").model), {}, presets.get("tiny"), tmp_path, horizon=0)
+
+
+def test_a_place_that_is_no_folder_is_told_before_the_run_is_read(tmp_path):
+    pytest.importorskip("flatbuffers", reason="flatbuffers (extra [export]) is not installed")
+    (tmp_path / "file").touch()
+    with pytest.raises(ValueError, match=r"OUT: .*/file is a file; name a new folder"):
+        export.export(export.Options(tmp_path / "run", tmp_path / "file"), screen.Screen())
+    with pytest.raises(OSError, match=r"OUT: nothing can be written into .*/file/below"):
+        export.export(export.Options(tmp_path / "run", tmp_path / "file/below"), screen.Screen())

@@ -134,6 +134,9 @@ class ModelConfig:
         check_choice("model.backbone", self.backbone, BACKBONES)
         for head in self.heads:
             check_choice("model.heads", head, tuple(KNOWN_HEADS))
+        if not self.heads or len(set(self.heads)) < len(self.heads):
+            raise ValueError(f"model.heads is {self.heads}; expected one or more heads, each once, of "
+                             f"{', '.join(KNOWN_HEADS)}.")
         if self.lidar is None and self.camera is None:
             raise ValueError("model.lidar and model.camera are both none: a model needs one of them.")
         if any(side % 32 for side in self.image_size):

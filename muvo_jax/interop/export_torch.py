@@ -19,6 +19,7 @@ with late.imports():
     from muvo_jax import config as config_lib
     from muvo_jax import safetensors_file
     from muvo_jax.interop import checkpoints, names
+    from muvo_jax.training import run_folder
 
 
 @dataclasses.dataclass(frozen=True)
@@ -43,7 +44,18 @@ python -m muvo_jax.interop.export_torch runs/paper-tr weights.safetensors
 
 
 def export(options: Options, show) -> None:
-    """Does what the command line asks for."""
+    """Does what the command line asks for.
+
+    Raises:
+      ValueError: if OUT is a folder, or lies in none.
+      OSError: if OUT cannot be written.
+    """
+    if options.out.is_dir():
+        raise ValueError(f"OUT: {options.out} is a folder; name a file, such as {options.out / 'weights.safetensors'}.")
+    if not options.out.absolute().parent.is_dir():
+        raise ValueError(f"OUT: there is no folder {options.out.parent} for {options.out.name}; make it, or name "
+                         f"another.")
+    run_folder.check_writable(options.out.absolute().parent, "OUT")
     loaded = command_line.load_run(options.run, options.checkpoint, show)
     variables = jax.tree.map(np.asarray, dict(loaded.variables))
     state_dict = names.reference_state_dict(variables, loaded.config.model)

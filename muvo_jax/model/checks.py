@@ -15,14 +15,16 @@ from muvo_jax.types import Batch, LatentState
 
 ACTION_CHANNELS = 2
 _ROUNDING = 1e-6
+_RECORDED = 1e-3  # so far beyond 1 may recorded actions lie (data/fields.py)
+_MOST = {"speed_mps": (10_000.0, "m/s"), "range_view": (10_000.0, "m"), "points": (10_000.0, "m")}
 
 
 def state(model: WorldModel, latent: LatentState) -> tuple[int, ...]:
     """Returns the leading axes of a latent state.
 
     Raises:
-      ValueError: if its last axes are not those of this model, both parts have other leading axes, or one is not
-        float32 (it is whatever dtype the model computes in).
+      ValueError: if its last axes are not those of this model, both parts have other leading axes, one of these is
+        empty, or a part is not float32 (it is whatever dtype the model computes in).
     """
     expected = jax.tree.map(lambda leaf: leaf.shape[1:], jax.eval_shape(lambda: model.initial_state(1)))
     leads = []
@@ -44,7 +46,15 @@ def state(model: WorldModel, latent: LatentState) -> tuple[int, ...]:
                          f"{list(jnp.shape(vantage.last))}.")
     if leads[0] != leads[1]:
         raise ValueError(f"state: deterministic has the leading axes {list(leads[0])}, stochastic {list(leads[1])}.")
+    some(leads[0], "state")
     return leads[0]
+
+
+def some(lead: tuple[int, ...], where: str) -> None:
+    """Raises ValueError where leading axes hold no state at all."""
+    if 0 in lead:
+        raise ValueError(f"{where}: got states with the leading axes {list(lead)}, expected at least one state; leave "
+                         f"the call out where there is none.")
 
 
 def actions(given, lead: tuple[int, ...], horizon: int | None, branches: int | None) -> tuple[int | None, int]:
@@ -89,15 +99,16 @@ def one_action(given, lead: tuple[int, ...], where: str, name: str = "action", *
     return jnp.asarray(given, jnp.float32)
 
 
-def action_values(given, where: str) -> None:
-    """Raises ValueError where a concrete action is not finite or outside [-1, 1]; traced values pass."""
+def action_values(given, where: str, beyond: float = _ROUNDING) -> None:
+    """Raises ValueError where a concrete action is not finite or outside [-1, 1] by more than `beyond`; traced values
+    pass."""
     if isinstance(given, jax.core.Tracer):
         return
     values = np.asarray(given)
     if not np.isfinite(values).all():
         count = np.count_nonzero(~np.isfinite(values))
         raise ValueError(f"{where}: {count} values of the actions {list(values.shape)} are not finite.")
-    if values.size and np.abs(values).max() > 1.0 + _ROUNDING:
+    if values.size and np.abs(values).max() > 1.0 + beyond:
         raise ValueError(f"{where}: actions {list(values.shape)} reach from {values.min():g} to {values.max():g}, "
                          f"expected [-1, 1] (acceleration, steering; see muvo_jax.config.ActionContract).")
 
@@ -163,17 +174,44 @@ def _finite(where: str, named: dict) -> None:
 
 
 def observation(where: str, model: WorldModel, batch: Batch) -> None:
-    """Raises ValueError where an input of the model, or an action, is concrete and not finite, or no known command;
-    also for a batch without windows or frames."""
+    """Raises ValueError where an input of the model, or an action, is concrete and not finite, or cannot be: an action
+    outside [-1, 1], an unknown command, see `plausible`; also for a batch without windows or frames."""
     if not (batch.batch_size and batch.frames):
         raise ValueError(f"{where}: got a batch of {batch.batch_size} windows of {batch.frames} frames, expected at "
                          f"least one of both.")
     read = {"action": batch.action, "range_view": batch.range_view}
     read |= {name: getattr(batch, name) for name in inputs(model.config)}
-    finite(where, **{name: value for name, value in read.items() if value is not None})
+    read = {name: value for name, value in read.items() if value is not None}
+    finite(where, **read)
+    action_values(batch.action, where, _RECORDED)
+    plausible(where, read)
     arrivals(where, model, batch.ego_motion, batch.is_first)
     for name in ("command", "next_command"):
         known_commands(where, name, read.get(name))
+
+
+def plausible(where: str, read: dict) -> None:
+    """Raises ValueError where concrete speeds or ranges are far beyond any car's, or a camera cannot be; traced values
+    pass. Finite as they are, states and pictures would not be."""
+    seen = {name: np.asarray(value) for name, value in _without_padding(read, unseen=jax.core.Tracer).items()
+            if name in {*_MOST, "intrinsics", "camera_to_ego"} and not isinstance(value, jax.core.Tracer)}
+    for name in _MOST.keys() & seen.keys():
+        (most, unit), values = _MOST[name], seen[name]
+        if values.size and max(values.max(), -values.min()) > most:
+            raise ValueError(f"{where}: {name} {list(values.shape)} reaches from {values.min():g} to "
+                             f"{values.max():g} {unit}; expected at most {most:g} {unit} either way.")
+    if "intrinsics" in seen:
+        focal_px = seen["intrinsics"][:, (0, 1), (0, 1)]
+        wrong = np.flatnonzero((focal_px <= 0.0).any(axis=-1))
+        if wrong.size:
+            raise ValueError(f"{where}: intrinsics of window {wrong[0]} have the focal lengths "
+                             f"{focal_px[wrong[0]].tolist()} px; expected fx and fy above 0, at [0, 0] and [1, 1].")
+    if "camera_to_ego" in seen:
+        turned = np.linalg.det(seen["camera_to_ego"][:, :3, :3])
+        wrong = np.flatnonzero(np.abs(turned - 1.0) >= 0.1)
+        if wrong.size:
+            raise ValueError(f"{where}: camera_to_ego of window {wrong[0]} has the determinant {turned[wrong[0]]:g} in "
+                             f"its first three rows and columns; expected a rotation, 1.")
 
 
 def arrivals(where: str, model: WorldModel, given, is_first) -> None:

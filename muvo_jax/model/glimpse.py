@@ -117,7 +117,7 @@ def look(config: ModelConfig, memory: Memory, rows: Array, vantage: Vantage,
     """
     heads = tuple(head for head in memory_lib.guessed_heads(config) if head in heads)
     places = as_kind(config.first_guess, LastSeen).memory_frames
-    stop = vantage.last + (vantage.steps > 0)
+    stop = vantage.last + (vantage.steps > 0).astype(jnp.int32)
     index = stop[:, None] + jnp.arange(-places, 0, dtype=jnp.int32)[None]
     known = (index >= vantage.first[:, None]) & (index >= 0)
     index = jnp.clip(index, 0, memory.pose.shape[1] - 1)

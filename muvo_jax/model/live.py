@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
+import difflib
 import functools
+import numbers
 from collections.abc import Mapping
 
 import flax.struct
@@ -13,7 +15,18 @@ import jax.numpy as jnp
 from muvo_jax.model import checks, rollout
 from muvo_jax.model import memory as memory_lib
 from muvo_jax.model.world_model import WorldModel, inputs
-from muvo_jax.types import UNTIMED_FIELDS, Array, ArrayLike, Batch, LatentState, Memory, Motion, Vantage, Variables
+from muvo_jax.types import (
+    BATCH_FIELDS,
+    UNTIMED_FIELDS,
+    Array,
+    ArrayLike,
+    Batch,
+    LatentState,
+    Memory,
+    Motion,
+    Vantage,
+    Variables,
+)
 
 
 @flax.struct.dataclass
@@ -40,7 +53,12 @@ def start_live(model: WorldModel, key: Array, batch_size: int = 1) -> LiveState:
       model: the model.
       key: typed key, or one per sample [B].
       batch_size: B, streams that are filtered side by side.
+
+    Raises:
+      ValueError: for a key that does not fit, or a batch_size that is no whole number of 1 or more.
     """
+    if isinstance(batch_size, bool) or not isinstance(batch_size, numbers.Integral) or batch_size < 1:
+        raise ValueError(f"start_live: batch_size is {batch_size!r}; expected a whole number of 1 or more.")
     keys = rollout.sample_keys(key, batch_size)
     keys = jax.vmap(jax.random.fold_in, (0, None))(keys, 1)  # the keys of the latents' noise in `observe`
     return LiveState(model.initial_state(batch_size), keys, jnp.zeros((batch_size,), jnp.int32),
@@ -65,13 +83,14 @@ def observe_step(model: WorldModel, variables: Variables, live: LiveState, obser
       LiveState; imagine from its `latent`.
 
     Raises:
-      ValueError: if shapes or dtypes do not fit the model, an action is out of range, or an input on the host not
-        finite.
+      ValueError: if shapes or dtypes do not fit the model, a field is unknown, an action is out of range, or an input
+        on the host not finite.
       TypeError: for forward-mode derivatives through convolutions that have none (ModelConfig.convolution).
     """
     batch_size = live.frame.shape[0]
     action = checks.one_action(previous_action, (batch_size,), "observe_step", "previous_action")
     checks.state(model, live.latent)
+    _check_fields(observation)
     fields = {name: jnp.asarray(value) if name in UNTIMED_FIELDS else jnp.expand_dims(jnp.asarray(value), 1)
               for name, value in observation.items()}
     batch = Batch(action=jnp.expand_dims(action, 1), is_first=jnp.expand_dims(live.frame == 0, 1), **fields)
@@ -85,6 +104,17 @@ def observe_step(model: WorldModel, variables: Variables, live: LiveState, obser
             checks.known_commands("observe_step", name, given)
     checks.forward_mode("observe_step", model, variables, live.latent, batch)
     return _observe_step(model, variables, live, batch, sampled)
+
+
+def _check_fields(observation: Mapping[str, ArrayLike]) -> None:
+    """Raises ValueError for a field that Batch lacks, or that the stream itself fills in."""
+    known = BATCH_FIELDS.keys() - {"action", "is_first"}
+    for name in observation:
+        if name not in known:
+            near = difflib.get_close_matches(str(name), known, n=1)
+            raise ValueError(f"observe_step: the observation has a field {name!r}; expected fields of "
+                             f"muvo_jax.types.Batch without action and is_first"
+                             + (f". Did you mean {near[0]!r}?" if near else "."))
 
 
 @functools.partial(jax.jit, static_argnames=("model", "sampled"))

@@ -28,8 +28,11 @@ def sample_keys(key: jax.Array, count: int) -> jax.Array:
     """One typed key per sample [count]: fold_in(key, index), or `key` itself where it holds one key per sample already.
 
     Raises:
-      ValueError: for raw keys or another number of keys.
+      ValueError: for what is no key, raw keys or another number of keys.
     """
+    if not isinstance(key, jax.Array):
+        raise ValueError(f"got the key {key!r:.100}, expected one typed key (jax.random.key) or one per sample, shape "
+                         f"({count},).")
     if not jax.dtypes.issubdtype(key.dtype, jax.dtypes.prng_key) or key.shape not in ((), (count,)):
         raise ValueError(f"got a key of dtype {key.dtype} and shape {key.shape}, expected one typed key "
                          f"(jax.random.key) or one per sample, shape ({count},).")
@@ -235,10 +238,13 @@ def decode(model: WorldModel, variables: Variables, states: LatentState | Dream 
     A model with first_guess="last_seen" needs the `memory` of the drives too: Observed.memory or LiveState.memory.
 
     Raises:
-      ValueError: for concrete states that the memory's evidence does not hold for (memory.with_evidence).
+      ValueError: for heads that are one name, or concrete states that the memory's evidence does not hold for
+        (memory.with_evidence).
       TypeError: for forward-mode derivatives through convolutions that have none (ModelConfig.convolution).
     """
     states = states.states if isinstance(states, Dream) else states
+    if isinstance(heads, str):
+        raise ValueError(f"decode: heads is {heads!r}; expected a sequence of names, ({heads!r},).")
     if isinstance(states, LatentState):
         memory_lib.check_evidence(states, memory)
     checks.forward_mode("decode", model, variables, states, memory)

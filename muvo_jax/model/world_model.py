@@ -274,6 +274,8 @@ class WorldModel:
         if features.shape[len(lead):] != shape:
             raise ValueError(f"decode: got features {list(features.shape)}, expected "
                              f"[{', '.join(map(str, ('...', *shape)))}] for the {self.config.latent.kind} latent.")
+        if 0 in lead:
+            raise ValueError(f"decode: got features {list(features.shape)}, expected at least one state.")
         vantage = None
         if set(memory_lib.guessed_heads(self.config)).isdisjoint(names):
             memory = None

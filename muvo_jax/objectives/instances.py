@@ -43,8 +43,8 @@ def _frame_targets(instances: types.Array, sigma_cells: float) -> tuple[types.Ar
     def add(carry, number):
         bumps, offsets = carry
         mask = instances == number
-        count = mask.sum()
-        middle = jnp.round(jnp.where(mask[..., None], place, 0.0).sum(axis=(0, 1)) / jnp.maximum(count, 1))
+        count = mask.sum().astype(jnp.float32)
+        middle = jnp.round(jnp.where(mask[..., None], place, 0.0).sum(axis=(0, 1)) / jnp.maximum(count, 1.0))
         away = middle[None, None] - place
         bump = jnp.where(count > 0, jnp.exp(-jnp.square(away).sum(axis=-1) / sigma_cells ** 2), 0.0)
         return (jnp.maximum(bumps, bump), jnp.where(mask[..., None], away, offsets)), None

@@ -133,7 +133,7 @@ def hit_voxels(points_m: Array, valid: Array, grid: VoxelGrid) -> Array:
         index = jnp.floor((points_m[..., axis] - grid.origin_m[axis]) / grid.voxel_size_m)
         inside = inside & (index >= 0) & (index < side)
         number = number * side + jnp.clip(index, 0, side - 1).astype(jnp.int32)
-    number = jnp.where(inside, number, cells) + (cells + 1) * jnp.arange(count)[:, None]
+    number = jnp.where(inside, number, cells) + (cells + 1) * jnp.arange(count, dtype=jnp.int32)[:, None]
     hits = jnp.zeros((count * (cells + 1),), jnp.float32).at[jax.lax.stop_gradient(number).reshape(-1)].set(1.0)
     return hits.reshape(count, cells + 1)[:, :cells].reshape(count, *grid.shape)
 

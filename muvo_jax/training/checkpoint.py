@@ -193,10 +193,12 @@ class Checkpoints:
         abstract = jax.tree.map(_abstract, like)
         for step in reversed(self.steps()):
             path = self.folder / str(step)
-            reason = integrity.damage(path)
-            if reason is None:
-                meta = checkpoint_meta.read(path)
-                checkpoint_meta.check_resumable(config, config_lib.Config.from_dict(meta["config"]), str(path))
+            described = checkpoint_meta.trusted(path)
+            if isinstance(described, str):
+                reason = described
+            else:
+                meta, stored = described
+                checkpoint_meta.check_resumable(config, stored, str(path))
                 try:
                     state = self._restore(step, abstract, like)
                 except Exception as error:  # whatever Orbax raises: the checkpoint before may still be good
@@ -282,10 +284,13 @@ def load_run(run: str | os.PathLike, which: int | str = "latest") -> run_lib.Run
         raise CheckpointError(f"{folder} {state}; expected {checkpoints}/STEP. Train first: python -m muvo_jax.train.")
     step, warnings = _readable(checkpoints, found, which)
     path = checkpoints / str(step)
-    meta = checkpoint_meta.read(path)
-    config = config_lib.Config.from_dict(meta["config"])
-    return run_lib.Run(world_model.WorldModel(config.model), _restore_variables(path / "variables"), config, step,
-                       folder, meta["provenance"], tuple(warnings))
+    described = checkpoint_meta.trusted(path)
+    if isinstance(described, str):  # since it was looked at
+        raise CheckpointError(f"checkpoint {path} is damaged: {described}.")
+    meta, config = described
+    model = world_model.WorldModel(config.model)
+    return run_lib.Run(model, _restore_variables(path, model), config, step, folder, meta["provenance"],
+                       tuple(warnings))
 
 
 def _readable(checkpoints: pathlib.Path, found: list[int], which: int | str) -> tuple[int, list[str]]:
@@ -297,10 +302,11 @@ def _readable(checkpoints: pathlib.Path, found: list[int], which: int | str) -> 
     warnings = []
     for step in [which] if isinstance(which, int) else found[::-1]:
         path = checkpoints / str(step)
-        if (reason := integrity.damage(path)) is not None:
-            warnings.append(f"checkpoint {path} is damaged: {reason}; it is passed over.")
+        described = checkpoint_meta.trusted(path)
+        if isinstance(described, str):
+            warnings.append(f"checkpoint {path} is damaged: {described}; it is passed over.")
         elif which == "best":
-            scores[step] = checkpoint_meta.read(path)["score"]
+            scores[step] = described[0]["score"]
         else:
             return step, warnings
     if not scores:
@@ -322,11 +328,29 @@ def _quiet() -> None:
     logging.getLogger("absl").setLevel(logging.CRITICAL)
 
 
-def _restore_variables(folder: pathlib.Path) -> types.Variables:
+def _restore_variables(path: pathlib.Path, model: world_model.WorldModel) -> types.Variables:
+    """Raises CheckpointError where a checkpoint's variables cannot be read, or are not those of the model."""
     _quiet()
+    folder = path / "variables"
     with ocp.StandardCheckpointer(multiprocessing_options=checkpoint_meta.alone()) as reader:
-        target = jax.tree.map(_on_first_device, reader.metadata(folder).item_metadata.tree)
-        return reader.restore(folder, target)
+        try:
+            tree = reader.metadata(folder).item_metadata.tree
+        except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+            raise CheckpointError(f"checkpoint {path} is damaged: what {folder} holds cannot be read "
+                                  f"({screen.said(error)}). Take another --checkpoint.") from error
+        _check_shapes(path, tree, model.variable_shapes())
+        return reader.restore(folder, jax.tree.map(_on_first_device, tree))
+
+
+def _check_shapes(path: pathlib.Path, stored, expected) -> None:
+    found = {jax.tree_util.keystr(keys): tuple(leaf.shape)
+             for keys, leaf in jax.tree_util.tree_leaves_with_path(stored)}
+    for keys, leaf in jax.tree_util.tree_leaves_with_path(expected):
+        name = jax.tree_util.keystr(keys)
+        if found.get(name) != leaf.shape:
+            came = f"is {list(found[name])}" if name in found else "is missing"
+            raise CheckpointError(f"checkpoint {path} is damaged: of its variables {name} {came}, and the model of its "
+                                  f"config has {list(leaf.shape)} there. Take another --checkpoint.")
 
 
 def _on_first_device(leaf) -> jax.ShapeDtypeStruct:
@@ -340,5 +364,6 @@ def _abstract(leaf):
 
 
 def _steps(folder: pathlib.Path) -> list[int]:
-    return sorted(int(path.name) for path in folder.iterdir() if path.is_dir() and path.name.isdigit()) \
-        if folder.is_dir() else []
+    """Of the folders that are named as a save names them; 007 and ² are none."""
+    named = [path.name for path in folder.iterdir() if path.is_dir()] if folder.is_dir() else []
+    return sorted(int(name) for name in named if name.isascii() and name.isdecimal() and str(int(name)) == name)

@@ -14,9 +14,15 @@ import orbax.checkpoint as ocp
 
 from muvo_jax import config as config_lib
 from muvo_jax.config import settings
+from muvo_jax.training import integrity
 
 SCHEMA_VERSION = 1
+_READ = frozenset({"schema_version", "config", "packages", "provenance", "data_state", "score"})
 _PACKAGES = ("muvo_jax", "jax", "jaxlib", "flax", "optax", "orbax-checkpoint", "numpy")
+
+
+class DescriptionError(ValueError):
+    """A stored description is none; the message goes on from the checkpoint's name."""
 
 
 def describe(step: int, config: config_lib.Config, provenance: Mapping[str, Any] | None, data_state=None,
@@ -32,14 +38,38 @@ def read(folder: pathlib.Path) -> dict[str, Any]:
     """The stored description of a checkpoint.
 
     Raises:
+      DescriptionError: where there is none, or not what `describe` makes.
       ValueError: for an unknown schema version.
     """
-    with ocp.Checkpointer(ocp.JsonCheckpointHandler(), multiprocessing_options=alone()) as reader:
-        meta = reader.restore(folder / "meta")
-    if meta["schema_version"] != SCHEMA_VERSION:
+    try:
+        with ocp.Checkpointer(ocp.JsonCheckpointHandler(), multiprocessing_options=alone()) as reader:
+            meta = reader.restore(folder / "meta")
+    except (OSError, ValueError, RecursionError) as error:
+        raise DescriptionError(f"its description in meta/ cannot be read ({error})") from error
+    if not isinstance(meta, dict):
+        raise DescriptionError(f"its description in meta/ is a {type(meta).__name__}, not an object of JSON")
+    if meta.get("schema_version", SCHEMA_VERSION) != SCHEMA_VERSION:
+        writer = meta.get("packages", {}).get("muvo_jax")
         raise ValueError(f"{folder} has checkpoint schema {meta['schema_version']}, this version reads "
-                         f"{SCHEMA_VERSION}. It was written by muvo_jax {meta['packages'].get('muvo_jax')}: use that.")
+                         f"{SCHEMA_VERSION}. It was written by muvo_jax {writer}: use that.")
+    if missing := sorted(_READ - meta.keys()):
+        raise DescriptionError(f"its description in meta/ lacks {', '.join(missing)}")
     return meta
+
+
+def trusted(folder: pathlib.Path) -> tuple[dict[str, Any], config_lib.Config] | str:
+    """The description and the config of a checkpoint; or why it cannot be trusted.
+
+    Raises:
+      ValueError: where it was written by a version with an unknown schema or configuration.
+    """
+    if (reason := integrity.damage(folder)) is not None:
+        return reason
+    try:
+        meta = read(folder)
+        return meta, config_lib.Config.from_dict(meta["config"])
+    except DescriptionError as error:
+        return str(error)
 
 
 def alone() -> ocp.options.MultiprocessingOptions:

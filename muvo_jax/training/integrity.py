@@ -10,6 +10,7 @@ import pathlib
 SCHEMA_VERSION = 1
 CHECKSUM_FILE = "checksums.json"
 DAMAGED_FOLDER = "damaged_checkpoints"
+_ITEMS = ("meta", "variables")  # every checkpoint has these; `training` only those that a run goes on from
 
 
 def damage(folder: pathlib.Path) -> str | None:
@@ -20,6 +21,9 @@ def damage(folder: pathlib.Path) -> str | None:
         return f"it has no {CHECKSUM_FILE}, so saving was interrupted"
     except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
         return f"its {CHECKSUM_FILE} cannot be read"
+    for item in _ITEMS:
+        if not any(name.startswith(f"{item}/") for name, _ in listed):
+            return f"its {CHECKSUM_FILE} lists nothing of {item}/"
     for name, expected in listed:
         path = folder / name
         if not path.is_file():
@@ -47,7 +51,7 @@ def set_aside(folder: pathlib.Path, run_folder: str | os.PathLike) -> pathlib.Pa
 
 def seal(folder: pathlib.Path) -> None:
     """Lists the checksums of all files of a complete checkpoint; the list appears as a whole or not at all."""
-    files = {str(path.relative_to(folder)): _sha256(path) for path in sorted(folder.rglob("*")) if path.is_file()}
+    files = {path.relative_to(folder).as_posix(): _sha256(path) for path in sorted(folder.rglob("*")) if path.is_file()}
     partial = folder / (CHECKSUM_FILE + ".part")
     with partial.open("w", encoding="utf-8") as file:
         json.dump({"schema_version": SCHEMA_VERSION, "files": files}, file, indent=1)

@@ -231,7 +231,7 @@ class _Run:
     def _check(self, late: int) -> None:
         """Looks at all steps but the last `late`: neither does the device wait for the host, nor do batches pile up.
 
-        A step that was not finite has changed nothing; its successors ran from the same parameters.
+        A step that was not finite has changed no parameter; its successors ran from the same parameters.
         """
         while len(self.unchecked) > late:
             step, metrics = self.unchecked.popleft()

@@ -71,7 +71,21 @@ def make_optimizer(config: config_lib.OptimizerConfig, total_steps: int, *,
         learning_rate=learning_rate(config, total_steps), b1=beta1(config, total_steps), b2=config.beta2,
         eps=config.epsilon, weight_decay=config.weight_decay, mask=decays)
     clipped = optax.chain(optax.clip_by_global_norm(config.clip_norm), adamw) if config.clip_norm > 0.0 else adamw
+    clipped = _promoting(clipped)
     return clipped if leaf_by_leaf else packed(clipped)
+
+
+def _promoting(inner: optax.GradientTransformation) -> optax.GradientTransformation:
+    """`inner`, also where the user has JAX refuse implicit promotion of dtypes, on which optax relies."""
+    def init(params):
+        with jax.numpy_dtype_promotion("standard"):
+            return inner.init(params)
+
+    def update(gradients, state, params=None):
+        with jax.numpy_dtype_promotion("standard"):
+            return inner.update(gradients, state, params)
+
+    return optax.GradientTransformation(init, update)
 
 
 def with_constants(state: types.Array, fresh: types.Array) -> types.Array:

@@ -7,6 +7,7 @@ import json
 import math
 import os
 import pathlib
+import tempfile
 import time
 from collections.abc import Iterator, Mapping
 from typing import Any
@@ -130,6 +131,26 @@ def check_new(path: str | os.PathLike, again: str) -> None:
     if not parent.is_dir() or not os.access(parent, os.W_OK | os.X_OK):
         state = "cannot be written to" if parent.is_dir() else "is a file"
         raise OSError(f"{parent} {state}, so that {path} cannot be made: choose another --runs-dir or --name.")
+
+
+def check_writable(path: str | os.PathLike, name: str) -> None:
+    """Whether a folder can be written into, or made, for the moment before anything takes long. Leaves nothing.
+
+    Args:
+      name: what the user calls it, for the message, such as "--out".
+
+    Raises:
+      OSError: where it cannot.
+    """
+    path = there = pathlib.Path(path).expanduser().absolute()
+    try:
+        there = next(parent for parent in (path, *path.parents) if parent.exists())
+        with tempfile.TemporaryFile(dir=there):  # os.access knows neither root's rights nor read-only file systems
+            pass
+    except OSError as error:
+        said = "it is a file" if there.is_file() else error.strerror or str(error)
+        raise OSError(f"{name}: nothing can be written into {path} ({there}: {said}). Choose another folder, or mend "
+                      f"that.") from error
 
 
 def create(path: str | os.PathLike, config: config_lib.Config, again: str) -> None:

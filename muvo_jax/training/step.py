@@ -63,8 +63,9 @@ def make_train_step(model: world_model.WorldModel, config: config_lib.Config, *,
     The metrics are float32 scalars: every loss term (unweighted), "total", "psnr_db" of the decoded images
     (imagined ones among them where config.train.observe_frames leaves some), "learning_rate", the norms
     "gradient_norm", "parameter_norm", "update_norm" of what trains, and "finite" (1 or 0).
-    An update that is not finite is not applied, so the parameters stay usable (its "update_norm" is 0, its rate that of
-    the update before); the step is counted.
+    Where loss or gradients are not finite nothing is applied, so the parameters stay usable ("update_norm" is 0, the
+    rate that of the update before); the step is counted. An update that is not finite although they are changes the
+    optimiser's state alone ("update_norm" says what it was).
 
     Args:
       model: what is trained.
@@ -94,7 +95,11 @@ def make_train_step(model: world_model.WorldModel, config: config_lib.Config, *,
         def updated():
             updates, opt_state = optimizer.update(gradients, state.opt_state, trained)
             norms = {"parameter_norm": norm(trained), "update_norm": norm(updates)}
-            return (optax.apply_updates(trained, updates), batch_stats, opt_state), norms
+            # Gradients are finite here, and so are the moments that they enter, but their quotient may not be. The old
+            # moments are not kept: that would cost a copy of them in every step.
+            sound = jnp.isfinite(norms["update_norm"])
+            after, before = (optax.apply_updates(trained, updates), batch_stats), (trained, state.batch_stats)
+            return (*jax.tree.map(lambda new, old: jnp.where(sound, new, old), after, before), opt_state), norms
 
         def kept():
             return (trained, state.batch_stats, state.opt_state), {"parameter_norm": norm(trained),
@@ -104,7 +109,7 @@ def make_train_step(model: world_model.WorldModel, config: config_lib.Config, *,
         # parameters as soon as it can, at the start of the step, and keeps the copies through all of it.
         (params, batch_stats_after, opt_state), norms = jax.lax.cond(finite, updated, kept)
         metrics |= {"learning_rate": _applied_rate(opt_state), "gradient_norm": gradient_norm,
-                    "finite": finite.astype(jnp.float32)} | norms
+                    "finite": (finite & jnp.isfinite(norms["update_norm"])).astype(jnp.float32)} | norms
         return state.replace(step=state.step + 1, params=trainable.merge(params, frozen_params),
                              batch_stats=batch_stats_after, opt_state=opt_state), metrics
 

@@ -100,9 +100,10 @@ def windows(frames: pipeline.Frames, split: str, count: int,
 def windows_of_run(run: run_lib.Run | str | os.PathLike, split: str | None = None, *, count: int,
                    frames: int | None = None) -> types.Batch:
     """See muvo_jax.windows."""
-    if count < 1 or (frames is not None and frames < 1):
-        raise ValueError(f"windows: count is {count}, frames is {frames}; expected whole numbers of 1 or more, or no "
-                         f"frames for context + horizon.")
+    whole = lambda given: isinstance(given, int | np.integer) and not isinstance(given, bool) and given >= 1
+    if not whole(count) or not (frames is None or whole(frames)):
+        raise ValueError(f"windows: count is {count!r}, frames is {frames!r}; expected whole numbers of 1 or more, or "
+                         f"no frames for context + horizon.")
     config = (run if isinstance(run, run_lib.Run) else checkpoint.load_run(run)).config
     recording = recordings.open_configured(config, split=split or recordings.HELD_OUT)
     held_out = [name for name in recording.description.splits if name != "train"]

@@ -1,6 +1,8 @@
 """From a checkpoint of the authors to a run and back, without torch; what does not fit is named and leaves nothing."""
 
+import errno
 import json
+import pathlib
 import resource
 import shutil
 import time
@@ -159,6 +161,22 @@ def test_a_full_disk_is_named_and_leaves_no_folder(tmp_path, monkeypatch):
     with pytest.raises(OSError, match=r"could not be written to .*new/run: RuntimeError: No space left"):
         convert._write(tmp_path / "new" / "run", 0, {}, presets.get("tiny"), {"source": "a", "recognised": None})
     assert not list(tmp_path.iterdir())
+    assert convert._of_disk(OSError(errno.EDQUOT, "")) and convert._of_disk(ValueError("a: No space left on device"))
+    assert not convert._of_disk(OSError(errno.EBUSY, "Device or resource busy"))
+
+
+@pytest.mark.parametrize("out", [".", "..", "below/.."])
+def test_the_current_folder_is_no_folder_of_a_run(tmp_path, monkeypatch, out):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(ValueError, match=r"--out is .*, the current folder or one around it; .* --out=runs/NAME"):
+        run_convert(tmp_path / "a.ckpt", pathlib.Path(out))
+
+
+def test_weights_are_exported_into_a_file_that_can_be(tmp_path):
+    for out, message in ((tmp_path, r"OUT: .* is a folder; name a file"),
+                         (tmp_path / "none/w.safetensors", r"OUT: there is no folder .*/none for w\.safetensors")):
+        with pytest.raises(ValueError, match=message):
+            export_torch.export(export_torch.Options(tmp_path / "run", out), screen.Screen())
 
 
 @pytest.mark.slow

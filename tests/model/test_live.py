@@ -83,3 +83,17 @@ def test_bad_actions_are_refused(action, message):
 def test_missing_sensors_are_named():
     with pytest.raises(ValueError, match=r"Batch\.image is None"):
         live.observe_step(MODEL, {}, live.start_live(MODEL, jax.random.key(0)), {}, np.zeros((1, 2)))
+
+
+@pytest.mark.parametrize("observation, message", [
+    ({"imgae": 1}, r"has a field 'imgae'; .* Did you mean 'image'\?"),
+    ({"action": 1}, "has a field 'action'; expected")])
+def test_unknown_fields_are_named(observation, message):
+    with pytest.raises(ValueError, match=message):
+        live.observe_step(MODEL, {}, live.start_live(MODEL, jax.random.key(0)), observation, np.zeros((1, 2)))
+
+
+@pytest.mark.parametrize("count", [0, -1, 1.5, True])
+def test_streams_are_counted(count):
+    with pytest.raises(ValueError, match=f"start_live: batch_size is {count}; expected a whole number of 1 or more"):
+        live.start_live(MODEL, jax.random.key(0), count)

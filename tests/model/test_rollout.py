@@ -231,6 +231,10 @@ def test_training_windows_use_dropout_and_update_statistics(variables):
     ({"actions_or_policy": np.zeros((BATCH, 3, 2), np.float32), "key": jax.random.split(jax.random.key(0), 5)},
      "one typed key"),
     ({"actions_or_policy": np.zeros((BATCH, 3, 2), np.float32), "key": jax.random.PRNGKey(0)}, "one typed key"),
+    ({"actions_or_policy": np.zeros((BATCH, 3, 2), np.float32), "key": 7}, "got the key 7, expected one typed key"),
+    ({"actions_or_policy": np.zeros((0, 3, 2), np.float32),
+      "state": LatentState(np.zeros((0, 16), np.float32), np.zeros((0, 8), np.float32))},
+     r"state: got states with the leading axes \[0\], expected at least one"),
 ])
 def test_misfits_are_refused(variables, state, arguments, message):
     with pytest.raises(ValueError, match=message):
@@ -263,6 +267,39 @@ def test_a_batch_of_nothing_is_refused():
     for batch, came in ((make_batch()[:0], "0 windows of 3"), (make_batch().time_slice(0, 0), "2 windows of 0")):
         with pytest.raises(ValueError, match=f"observe: got a batch of {came} frames, expected at least one"):
             rollout.observe(MODEL, {}, jax.random.key(0), batch)
+
+
+@pytest.mark.parametrize("field, change, message", [
+    ("action", lambda action: action * 0 + 30, r"observe: actions \[2, 3, 2\] reach from 30 to 30, expected \[-1, 1\]"),
+    ("action", lambda action: action * 0 + 1.0011, "reach from 1.0011"),
+    ("speed_mps", lambda speed: speed + 1e30, r"observe: speed_mps \[2, 3\] reaches from 1e\+30 .* at most 10000 m/s"),
+    ("range_view", lambda view: view - 2e4, r"observe: range_view .* at most 10000 m either way"),
+])
+def test_observations_that_cannot_be_are_refused(field, change, message):
+    batch = make_batch()
+    with pytest.raises(ValueError, match=message):
+        rollout.observe(MODEL, {}, jax.random.key(0), batch.replace(**{field: change(getattr(batch, field))}))
+
+
+def test_cameras_that_cannot_be_are_refused_and_what_readers_let_through_is_not():
+    batch = make_batch()
+    intrinsics, camera = np.stack([np.float32(np.diag([30.0, 30.0, 1.0]))] * BATCH), np.stack([np.eye(4)] * BATCH)
+    read = {"points": np.full((1, 1, 2, 3), np.float32([[1.0], [1e9]])), "point_count": np.int32([[1]])}
+    checks.plausible("observe", {"intrinsics": intrinsics, "camera_to_ego": camera} | read)
+    checks.action_values(np.float32(1.001) * np.sign(batch.action), "observe", checks._RECORDED)
+    with pytest.raises(ValueError, match=r"points \[1, 1, 2, 3\] reaches"):
+        checks.plausible("observe", read | {"point_count": np.int32([[2]])})
+    with pytest.raises(ValueError, match=r"intrinsics of window 1 have the focal lengths \[30.0, 0.0\] px"):
+        checks.plausible("observe", {"intrinsics": intrinsics * np.float32([[[1]] * 3, [[1], [0], [1]]])})
+    with pytest.raises(ValueError, match="camera_to_ego of window 0 has the determinant 0 in"):
+        checks.plausible("observe", {"camera_to_ego": camera * 0})
+
+
+def test_one_name_is_no_sequence_of_heads(state):
+    with pytest.raises(ValueError, match=r"heads is 'image'; expected a sequence of names, \('image',\)"):
+        rollout.decode(MODEL, {}, state, "image")
+    with pytest.raises(ValueError, match=r"decode: got features \[0, 24\], expected at least one state"):
+        rollout.decode(MODEL, {}, state[:0])
 
 
 def test_a_temperature_for_each_state_is_mapped(variables, state, actions):

@@ -53,7 +53,7 @@ def test_labels_that_are_no_class_do_not_count():
         jax.tree.map(np.testing.assert_array_equal, score(logits, target[None, None]), expected)
 
 
-def test_instances_have_a_centre_and_each_cell_knows_the_way():
+def test_instances_have_a_centre_and_each_cell_knows_the_way(strict_dtypes):
     numbers = np.zeros((1, 6, 8), np.int32)
     numbers[0, 1:4, 2:5], numbers[0, 5, 7] = 1, 2
     centre, offset, inside = jax.jit(lambda numbers: instances.targets(numbers, 2.0))(numbers)

@@ -70,6 +70,9 @@ class SmallWorld:
         return {"params": jax.tree.map(fill, shapes["params"]),
                 "batch_stats": jax.tree.map(unit, shapes["batch_stats"])}
 
+    def variable_shapes(self):
+        return jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype), SmallWorld.init(self))
+
     def _example(self):
         batch, state = make_batch(self.config, frames=1), self.initial_state(WINDOWS)
         noise = types.StepNoise(state.stochastic, state.stochastic, jnp.zeros(WINDOWS, bool))

@@ -78,8 +78,9 @@ def test_the_loss_compares_with_the_recorded_image(monkeypatch, train):
                         lambda batch, keys, settings: dataclasses.replace(batch, image=255 - batch.image))
     monkeypatch.setattr(step_lib.rollout, "observe_window", observe_window)
     monkeypatch.setattr(step_lib.scoring, "sums", sums)
-    model = python_types.SimpleNamespace(config=dataclasses.replace(presets.tiny().model, heads=()))
-    step_lib.forward({}, {}, batch, None, model=model, config=presets.tiny(), train=train, axis_name=None)
+    model = python_types.SimpleNamespace(config=dataclasses.replace(presets.tiny().model, heads=("action",)))
+    unweighted = config_lib.override(presets.tiny(), "loss.action", 0.0)
+    step_lib.forward({}, {}, batch, None, model=model, config=unweighted, train=train, axis_name=None)
     np.testing.assert_array_equal(seen["loss"].image, batch.image)
     np.testing.assert_array_equal(seen["encoder"].image, 255 - batch.image if train else batch.image)
 

@@ -28,7 +28,7 @@ def test_a_step_may_be_named_in_words_and_windows_are_counted_before_they_are_re
     assert muvo_jax.load("builtin:small", "7").step == 7
     with pytest.raises(checkpoint.CheckpointError, match="has step 7 alone, not 8"):
         muvo_jax.load("builtin:small", "8")
-    for count, frames in ((0, None), (2, 0), (2, -3)):
+    for count, frames in ((0, None), (2, 0), (2, -3), (1.5, None), (2, 2.0)):
         with pytest.raises(ValueError, match=f"count is {count}, frames is {frames}; expected whole numbers"):
             muvo_jax.windows("builtin:small", count=count, frames=frames)
 

@@ -5,6 +5,7 @@ import errno
 import json
 import os
 import pathlib
+import shutil
 import subprocess
 import sys
 import textwrap
@@ -41,6 +42,12 @@ def _fresh(config):
                  "batch_stats": {"norm": {"mean": jnp.zeros(3)}}}
     return state.create(variables, optimizer.make_optimizer(config.optimizer, 10), jax.random.key(7),
                         config.train.trainable)
+
+
+@pytest.fixture(autouse=True)
+def few_leaves(fresh, monkeypatch):
+    """The model of a run is to have the variables of `fresh`."""
+    monkeypatch.setattr(world_model.WorldModel, "variable_shapes", lambda self: fresh.variables)
 
 
 def _at(fresh, step):
@@ -240,6 +247,7 @@ def test_eight_devices_write_and_one_reads(tmp_path, fresh, config):
     result = _run(f"""
         import jax, json
         from muvo_jax.training import checkpoint
+        checkpoint.world_model.WorldModel.variable_shapes = lambda self: {{}}
         loaded = checkpoint.load_run({str(tmp_path)!r})
         leaves = jax.tree.leaves(loaded.variables)
         print(json.dumps([jax.device_count(), len(leaves), sum(float(leaf.sum()) for leaf in leaves)]))
@@ -341,3 +349,59 @@ def test_a_list_of_checksums_that_is_none_is_damage(tmp_path, fresh, config, fil
     (tmp_path / "checkpoints/2/checksums.json").write_text(json.dumps({"files": files}))
     restored = keeper.restore_latest(fresh, config)
     assert restored.step == 1 and "checksums.json cannot be read" in restored.warnings[0]
+
+
+def _reseal(folder):
+    (folder / integrity.CHECKSUM_FILE).unlink()
+    integrity.seal(folder)
+
+
+def _without_variables(folder):
+    shutil.rmtree(folder / "variables")
+    _reseal(folder)
+
+
+def _empty_list(folder):
+    (folder / integrity.CHECKSUM_FILE).write_text('{"files": {}}')
+
+
+def _described_as(change):
+    def harm(folder):
+        meta = folder / "meta/metadata"
+        meta.write_text(change(json.loads(meta.read_text())))
+        _reseal(folder)
+    return harm
+
+
+@pytest.mark.parametrize("harm, reason", [
+    (_empty_list, "lists nothing of meta/"), (_without_variables, "lists nothing of variables/"),
+    (_described_as(lambda meta: "{"), "description in meta/ cannot be read"),
+    (_described_as(lambda meta: "[]"), "is a list, not an object"),
+    (_described_as(lambda meta: json.dumps({"schema_version": 1})), "lacks config, data_state, packages"),
+])
+def test_what_describes_no_checkpoint_is_damage(tmp_path, fresh, config, harm, reason):
+    keeper = _save(tmp_path, fresh, config, 1, 2)
+    harm(tmp_path / "checkpoints/2")
+    restored, loaded = keeper.restore_latest(fresh, config), checkpoint.load_run(tmp_path)
+    assert restored.step == loaded.step == 1
+    assert reason in restored.warnings[0] and reason in loaded.warnings[0]
+    with pytest.raises(checkpoint.CheckpointError, match=reason):
+        checkpoint.load_run(tmp_path, 2)
+
+
+def test_variables_of_another_model_than_that_of_the_config_are_refused(tmp_path, fresh, config, monkeypatch):
+    _save(tmp_path, fresh, config, 1).close()
+    other = jax.tree.map(lambda leaf: jnp.zeros((*leaf.shape, 2)), fresh.variables)
+    monkeypatch.setattr(world_model.WorldModel, "variable_shapes", lambda self: other)
+    with pytest.raises(checkpoint.CheckpointError, match=r"\['norm'\]\['mean'\] is \[3\], .* config has \[3, 2\]"):
+        checkpoint.load_run(tmp_path)
+    monkeypatch.setattr(world_model.WorldModel, "variable_shapes", lambda self: {"params": {"more": jnp.zeros(1)}})
+    with pytest.raises(checkpoint.CheckpointError, match=r"\['more'\] is missing, .* has \[1\] there"):
+        checkpoint.load_run(tmp_path)
+
+
+def test_folders_that_no_save_named_are_no_checkpoints(tmp_path, fresh, config):
+    _save(tmp_path, fresh, config, 1).close()
+    for name in ("\u00b2", "007", "\u0663", "old"):
+        (tmp_path / "checkpoints" / name).mkdir()
+    assert checkpoint.load_run(tmp_path).step == 1

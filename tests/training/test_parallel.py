@@ -200,6 +200,15 @@ def test_a_loss_that_is_not_finite_changes_nothing_but_the_step():
     jax.tree.map(np.testing.assert_array_equal, after.variables, state.variables)
 
 
+def test_an_update_that_is_not_finite_is_not_applied_though_loss_and_gradients_are():
+    _, _, batch, state = setting(heads=FEW)
+    broken = optax.tree_utils.tree_set(state.opt_state, eps=jnp.float32(np.nan))
+    after, metrics = compiled_step()(copy_of(state).replace(opt_state=copy_of(broken)), batch)
+    assert np.isfinite([float(metrics["total"]), float(metrics["gradient_norm"])]).all()
+    assert float(metrics["finite"]) == 0.0 and np.isnan(float(metrics["update_norm"]))
+    jax.tree.map(np.testing.assert_array_equal, after.variables, state.variables)
+
+
 def test_the_logged_rate_is_the_applied_one_after_a_skipped_step_too():
     _, config, batch, state = setting(heads=FEW)
     broken = batch.replace(action=np.full_like(batch.action, np.nan))

@@ -32,7 +32,7 @@ _LITTLE_WORK = 5e9  # floating-point operations below which a layer is not worth
 
 def pays(x, kernel, padding: Pairs) -> bool:
     """Whether a stride-1 convolution of x [N, H, W, C] with kernel [*K, C, O] is faster in this form (measured:
-    experiments/speed/convolutions.md)."""
+    experiments/speed/paper.md)."""
     without_emitters = _WITHOUT_EMITTERS in os.environ.get("XLA_FLAGS", "")
     fewest = _FEWEST_CHANNELS if without_emitters else _FEWEST_WITH_EMITTERS
     if kernel.shape[:-2] != (3, 3) or min(kernel.shape[-2:]) < fewest:

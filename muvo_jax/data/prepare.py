@@ -49,7 +49,8 @@ def prepare_frame(raw: schema.RawFrame, config: config_lib.Config) -> PreparedFr
     if lacking:
         raise schema.DataError(f"frame {int(raw['frame_id'])} has no {', '.join(lacking)}, which the model needs. "
                                f"Choose windows of sequences that have it (schema.Sequence.has).")
-    ready: PreparedFrame = {name: raw[name] for name in ("action", "timestamp_s", "frame_id")}
+    ready: PreparedFrame = {name: raw[name] for name in ("timestamp_s", "frame_id")}
+    ready["action"] = applied(raw["action"])
     try:
         if model.camera is not None or "image" in targets:
             ready["image"], ready["intrinsics"] = camera_ops.resize_crop(raw["image"], raw["intrinsics"],
@@ -102,6 +103,11 @@ def _moving(raw: schema.RawFrame, ready: PreparedFrame, config: config_lib.Confi
     if "occupancy_moving_mask" in raw and "occupancy" in ready:
         masks["occupancy_moving_mask"] = raw["occupancy_moving_mask"]
     return masks
+
+
+def applied(action: np.ndarray) -> np.ndarray:
+    """A recorded action within [-1, 1], as imagination takes it: readers let pass what lies a rounding beyond."""
+    return np.clip(action, -1.0, 1.0)
 
 
 def _labels(raw: schema.RawFrame, config: config_lib.Config) -> PreparedFrame:

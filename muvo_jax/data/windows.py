@@ -121,7 +121,7 @@ class StepActions:
         stop = min(window.indices[-1] + window.stride, sequence.length)
         for index in range(window.start, stop):
             if np.isnan(known[index]).any():
-                known[index] = self._recording.action(sequence, index)
+                known[index] = prepare.applied(self._recording.action(sequence, index))
         return np.stack([known[index:min(index + window.stride, stop)].mean(axis=0) for index in window.indices])
 
 

@@ -94,6 +94,15 @@ def test_the_first_action_stands_for_a_step_where_the_contract_says_so_and_every
     np.testing.assert_array_equal(one, other)
 
 
+@pytest.mark.parametrize("stride", [1, 3])
+def test_actions_that_lie_a_rounding_beyond_are_applied_in_full(stride, monkeypatch):
+    """Readers let 1.0005 pass; imagination under the recorded actions of a batch takes [-1, 1]."""
+    monkeypatch.setattr(MemoryRecording, "action", lambda *_: np.array([1.0005, -1.0005], np.float32))
+    frames = frames_of(frames=4, stride=stride)
+    batch = frames.batch([windows.Window(frames.recording.sequences[0], 1, 4, stride)])
+    np.testing.assert_array_equal(batch.action, np.broadcast_to(np.float32([1.0, -1.0]), (1, 4, 2)))
+
+
 def test_adapting_to_a_recording_keeps_what_the_run_says_of_steps():
     frames = frames_of()
     config = dataclasses.replace(frames.config, contract=config_lib.ActionContract(step_action="first"))

@@ -104,8 +104,12 @@ class Environment:
 
     @property
     def steps_before(self) -> int:
-        """How many steps the observation looks back: road.BEFORE_S of them; 0 for any but "road"."""
-        return max(1, round(road.BEFORE_S / self.step_s)) if self.observation == "road" else 0
+        """How many steps the observation looks back: road.BEFORE_S of them, if the model remembers so much; 0 for any
+        but "road"."""
+        guess = self.model.config.first_guess
+        if self.observation != "road" or not isinstance(guess, config_lib.LastSeen):
+            return 0
+        return min(max(1, round(road.BEFORE_S / self.step_s)), guess.memory_frames - 1)
 
     @property
     def decoded_heads(self) -> tuple[str, ...]:
@@ -206,9 +210,12 @@ class Environment:
 
     def road(self, state: EnvState, params: EnvParams, obstacles: Array) -> Array:
         """The observation "road" [road.CHANNELS] of a state with these `obstacles`."""
-        return road.observe(state.motion, params.route_of(state), episodes.Plans(obstacles, state.motion.pose),
-                            self.seen_ahead(params, state, state.time), None if state.past is None else state.past[0],
-                            grid=self.model.config.voxels, config=self.reward_config, pooled=self.pooled)
+        seen, before, seen_before = self.seen_ahead(params, state, state.time), None, None
+        if state.past is not None and seen is not None:
+            before, seen_before = state.past[0], jnp.where(state.time > self.steps_before, seen, 0.0)
+        plan = rewards.full_size(obstacles, self.model.config.voxels)
+        return road.observe(state.motion, params.route_of(state), episodes.Plans(plan, state.motion.pose), seen, before,
+                            seen_before, grid=self.model.config.voxels, config=self.reward_config, pooled=self.pooled)
 
     def step(self, key: Array, state: EnvState, action: Array, params: EnvParams) -> tuple[EnvState, Transition]:
         """One imagined step under action [2], clipped to [-1, 1]; see Transition. No auto-reset: `restart` does it."""

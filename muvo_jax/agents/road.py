@@ -31,8 +31,8 @@ PROBABILITY_UNIT = 0.5
 
 
 def observe(motion: Motion, route: route_lib.Route | None, obstacles: Plans, seen: Array | None,
-            before: Plans | None, *, grid: config_lib.VoxelGrid, config: rewards.RewardConfig,
-            pooled: bool = True) -> Array:
+            before: Plans | None, seen_before: Array | None, *, grid: config_lib.VoxelGrid,
+            config: rewards.RewardConfig, pooled: bool = True) -> Array:
     """The observation of one car: float32 [CHANNELS], each number about 1 where it is large.
 
     Speed; forward, left and turn of the route ahead in the car's frame; the probability that the car would touch
@@ -46,6 +46,7 @@ def observe(motion: Motion, route: route_lib.Route | None, obstacles: Plans, see
       obstacles: Plans [] of rewards.obstacle_plan.
       seen: [X, Y] of rewards.seen_plan in the frame of the start, or None.
       before: Plans [] of BEFORE_S earlier; None where that is not known, and everything counts as standing.
+      seen_before: as `seen`, what counts beside `before`: where that is decoded, too, the same scan; else nothing, 0.
       grid, config, pooled: of the model and the reward; see rewards.box_collision.
     """
     route = route_lib.straight() if route is None else route
@@ -60,6 +61,10 @@ def observe(motion: Motion, route: route_lib.Route | None, obstacles: Plans, see
     blocked = touches(obstacles)
     if seen is not None:
         blocked = jnp.maximum(blocked, rewards.box_collision(seen, places, grid, config.box))
-    was_blocked = blocked if before is None else touches(before)
+    was_blocked = blocked
+    if before is not None:
+        was_blocked = touches(before)
+        if seen_before is not None:
+            was_blocked = jnp.maximum(was_blocked, rewards.box_collision(seen_before, places, grid, config.box))
     return jnp.concatenate([motion.speed_mps[None] / SPEED_UNIT_MPS, (ahead[:, :2] / unit_m).reshape(-1), turn,
                             jax.lax.stop_gradient(jnp.concatenate([blocked, was_blocked])) / PROBABILITY_UNIT])

@@ -76,7 +76,8 @@ def actions(given, lead: tuple[int, ...], horizon: int | None, branches: int | N
     return (shape[rank] if has_branches else branches), shape[-2]
 
 
-def one_action(given, lead: tuple[int, ...], where: str, name: str = "action", *, clips: bool = False) -> jax.Array:
+def one_action(given, lead: tuple[int, ...], where: str, name: str = "action", *, clips: bool = False,
+               recorded: bool = False) -> jax.Array:
     """Returns the action [*lead, 2] of one step as float32.
 
     Values on the host (NumPy, lists) are looked at. Those on a device are clipped to [-1, 1] there instead: to look at
@@ -84,6 +85,7 @@ def one_action(given, lead: tuple[int, ...], where: str, name: str = "action", *
 
     Args:
       clips: whether the caller clips all values, so that those on the host need only be finite.
+      recorded: whether it may come from a recording, whose actions may lie a rounding beyond; they are clipped.
 
     Raises:
       ValueError: for another shape, or for values on the host that are not finite or outside [-1, 1].
@@ -95,8 +97,9 @@ def one_action(given, lead: tuple[int, ...], where: str, name: str = "action", *
     if isinstance(given, jax.Array):
         on_device = given.astype(jnp.float32)
         return on_device if isinstance(given, jax.core.Tracer) else jnp.clip(on_device, -1.0, 1.0)
-    action_values(np.clip(given, -1.0, 1.0) if clips else given, where)  # NaN stays
-    return jnp.asarray(given, jnp.float32)
+    clipped = np.clip(given, -1.0, 1.0)  # NaN stays
+    action_values(clipped if clips else given, where, _RECORDED if recorded else _ROUNDING)
+    return jnp.asarray(clipped if recorded else given, jnp.float32)
 
 
 def action_values(given, where: str, beyond: float = _ROUNDING) -> None:
@@ -207,11 +210,12 @@ def plausible(where: str, read: dict) -> None:
             raise ValueError(f"{where}: intrinsics of window {wrong[0]} have the focal lengths "
                              f"{focal_px[wrong[0]].tolist()} px; expected fx and fy above 0, at [0, 0] and [1, 1].")
     if "camera_to_ego" in seen:
-        turned = np.linalg.det(seen["camera_to_ego"][:, :3, :3])
-        wrong = np.flatnonzero(np.abs(turned - 1.0) >= 0.1)
+        turn = seen["camera_to_ego"][:, :3, :3]
+        skewed = np.abs(turn @ turn.swapaxes(-1, -2) - np.eye(3)[None]).max(axis=(-2, -1))
+        wrong = np.flatnonzero((skewed >= 0.1) | (np.linalg.det(turn) < 0.0))
         if wrong.size:
-            raise ValueError(f"{where}: camera_to_ego of window {wrong[0]} has the determinant {turned[wrong[0]]:g} in "
-                             f"its first three rows and columns; expected a rotation, 1.")
+            raise ValueError(f"{where}: camera_to_ego of window {wrong[0]} has {turn[wrong[0]].tolist()} in its first "
+                             f"three rows and columns; expected a rotation.")
 
 
 def arrivals(where: str, model: WorldModel, given, is_first) -> None:

@@ -88,7 +88,7 @@ def observe_step(model: WorldModel, variables: Variables, live: LiveState, obser
       TypeError: for forward-mode derivatives through convolutions that have none (ModelConfig.convolution).
     """
     batch_size = live.frame.shape[0]
-    action = checks.one_action(previous_action, (batch_size,), "observe_step", "previous_action")
+    action = checks.one_action(previous_action, (batch_size,), "observe_step", "previous_action", recorded=True)
     checks.state(model, live.latent)
     _check_fields(observation)
     fields = {name: jnp.asarray(value) if name in UNTIMED_FIELDS else jnp.expand_dims(jnp.asarray(value), 1)

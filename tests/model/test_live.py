@@ -9,7 +9,7 @@ import pytest
 
 from muvo_jax import config as config_lib
 from muvo_jax import presets
-from muvo_jax.model import live, rollout, world_model
+from muvo_jax.model import checks, live, rollout, world_model
 from muvo_jax.types import BATCH_FIELDS, Batch
 
 CONFIG = presets.get("tiny").model
@@ -78,6 +78,14 @@ def test_every_sensor_encoder_can_be_streamed(lidar, camera):
 def test_bad_actions_are_refused(action, message):
     with pytest.raises(ValueError, match=message):
         live.observe_step(MODEL, {}, live.start_live(MODEL, jax.random.key(0)), {}, action)
+
+
+def test_a_recorded_action_may_lie_a_rounding_beyond():
+    """Readers let it pass, `observe` too: a recording can be replayed as a stream."""
+    one = lambda **kind: checks.one_action(np.float32([[1.0005, -1.0005]]), (1,), "here", **kind)
+    np.testing.assert_array_equal(one(recorded=True), [[1.0, -1.0]])
+    with pytest.raises(ValueError, match=r"reach from -1\.0005 to 1\.0005"):
+        one()
 
 
 def test_missing_sensors_are_named():

@@ -291,8 +291,11 @@ def test_cameras_that_cannot_be_are_refused_and_what_readers_let_through_is_not(
         checks.plausible("observe", read | {"point_count": np.int32([[2]])})
     with pytest.raises(ValueError, match=r"intrinsics of window 1 have the focal lengths \[30.0, 0.0\] px"):
         checks.plausible("observe", {"intrinsics": intrinsics * np.float32([[[1]] * 3, [[1], [0], [1]]])})
-    with pytest.raises(ValueError, match="camera_to_ego of window 0 has the determinant 0 in"):
-        checks.plausible("observe", {"camera_to_ego": camera * 0})
+    sheared = camera.copy()
+    sheared[0, 0, 1] = 5.0
+    for wrong in (camera * 0, sheared, camera * np.float32([-1, 1, 1, 1])):
+        with pytest.raises(ValueError, match=r"camera_to_ego of window 0 has \[\[.* expected a rotation"):
+            checks.plausible("observe", {"camera_to_ego": wrong})
 
 
 def test_one_name_is_no_sequence_of_heads(state):

@@ -196,7 +196,7 @@ def around(environment: environment_lib.Environment, futures: Futures, index: An
     seen = before = seen_before = None
     if futures.seen is not None:
         seen = jnp.where(environment.holds_seen(step), futures.seen.plan[index, -1], 0.0)
-    if futures.seen is not None and (back := environment.steps_before):
+    if futures.seen is not None and seen is not None and (back := environment.steps_before):
         seen_before = jnp.where(step > back, seen, 0.0)
         later = decoded[index, jnp.maximum(step - back, 0)]
         later = Plans(rewards.full_size(later.plan, environment.model.config.voxels), later.pose)

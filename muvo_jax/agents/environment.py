@@ -213,9 +213,9 @@ class Environment:
         seen, before, seen_before = self.seen_ahead(params, state, state.time), None, None
         if state.past is not None and seen is not None:
             before, seen_before = state.past[0], jnp.where(state.time > self.steps_before, seen, 0.0)
-        plan = rewards.full_size(obstacles, self.model.config.voxels)
-        return road.observe(state.motion, params.route_of(state), episodes.Plans(plan, state.motion.pose), seen, before,
-                            seen_before, grid=self.model.config.voxels, config=self.reward_config, pooled=self.pooled)
+        plans = episodes.Plans(obstacles, state.motion.pose)
+        return road.observe(state.motion, params.route_of(state), plans, seen, before, seen_before,
+                            grid=self.model.config.voxels, config=self.reward_config, pooled=self.pooled)
 
     def step(self, key: Array, state: EnvState, action: Array, params: EnvParams) -> tuple[EnvState, Transition]:
         """One imagined step under action [2], clipped to [-1, 1]; see Transition. No auto-reset: `restart` does it."""

@@ -196,22 +196,21 @@ def around(environment: environment_lib.Environment, futures: Futures, index: An
     seen = before = seen_before = None
     if futures.seen is not None:
         seen = jnp.where(environment.holds_seen(step), futures.seen.plan[index, -1], 0.0)
-    if futures.seen is not None and seen is not None and (back := environment.steps_before):
-        seen_before = jnp.where(step > back, seen, 0.0)
-        later = decoded[index, jnp.maximum(step - back, 0)]
-        later = Plans(rewards.full_size(later.plan, environment.model.config.voxels), later.pose)
-        before = jax.tree.map(lambda scanned, later: jnp.where(step <= back, scanned, later),
-                              futures.seen[index, jnp.minimum(step, back)], later)
+        if back := environment.steps_before:
+            seen_before = jnp.where(step > back, seen, 0.0)
+            later = decoded[index, jnp.maximum(step - back, 0)]
+            later = Plans(rewards.full_size(later.plan, environment.model.config.voxels), later.pose)
+            before = jax.tree.map(lambda scanned, later: jnp.where(step <= back, scanned, later),
+                                  futures.seen[index, jnp.minimum(step, back)], later)
     return Around(decoded[index, step], feared, seen, before, seen_before,
                   jax.tree.map(lambda leaf: leaf[index], futures.routes))
 
 
 def look(environment: environment_lib.Environment, here: Around, motion: Motion) -> Array:
     """The observation [CHANNELS] of one car."""
-    grid = environment.model.config.voxels
-    plans = Plans(rewards.full_size(here.obstacles.plan, grid), here.obstacles.pose)
-    return road.observe(motion, here.route, plans, here.seen, here.before, here.seen_before, grid=grid,
-                        config=environment.reward_config, pooled=environment.pooled)
+    return road.observe(motion, here.route, here.obstacles, here.seen, here.before, here.seen_before,
+                        grid=environment.model.config.voxels, config=environment.reward_config,
+                        pooled=environment.pooled)
 
 
 def advance(environment: environment_lib.Environment, there: Around, motion: Motion, action: Array, step: Array,

@@ -56,15 +56,13 @@ def observe(motion: Motion, route: route_lib.Route | None, obstacles: Plans, see
     straight = jnp.stack([jnp.asarray(STRAIGHT_M), *2 * [jnp.zeros(STRAIGHT_M.size, jnp.float32)]], axis=-1)
     places = jnp.concatenate([route_lib.ahead(route, motion.pose, CLEARANCE_M),
                               motion_ops.placed(jnp.broadcast_to(motion.pose, straight.shape), straight)])
-    touches = lambda plans: rewards.box_collision(plans.plan, motion_ops.relative(places, plans.pose[None]), grid,
-                                                  config.box, pooled=pooled)
-    blocked = touches(obstacles)
-    if seen is not None:
-        blocked = jnp.maximum(blocked, rewards.box_collision(seen, places, grid, config.box))
-    was_blocked = blocked
-    if before is not None:
-        was_blocked = touches(before)
-        if seen_before is not None:
-            was_blocked = jnp.maximum(was_blocked, rewards.box_collision(seen_before, places, grid, config.box))
+
+    def touched(plans: Plans, scan: Array | None) -> Array:
+        decoded = rewards.box_collision(rewards.full_size(plans.plan, grid), motion_ops.relative(
+            places, plans.pose[None]), grid, config.box, pooled=pooled)
+        return decoded if scan is None else jnp.maximum(decoded, rewards.box_collision(scan, places, grid, config.box))
+
+    blocked = touched(obstacles, seen)
+    was_blocked = blocked if before is None else touched(before, seen_before)
     return jnp.concatenate([motion.speed_mps[None] / SPEED_UNIT_MPS, (ahead[:, :2] / unit_m).reshape(-1), turn,
                             jax.lax.stop_gradient(jnp.concatenate([blocked, was_blocked])) / PROBABILITY_UNIT])

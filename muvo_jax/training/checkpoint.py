@@ -282,23 +282,19 @@ def load_run(run: str | os.PathLike, which: int | str = "latest") -> run_lib.Run
         state = ("has no checkpoint yet" if folder.is_dir() else "is a file, and no run's folder" if folder.exists()
                  else "does not exist")
         raise CheckpointError(f"{folder} {state}; expected {checkpoints}/STEP. Train first: python -m muvo_jax.train.")
-    step, warnings = _readable(checkpoints, found, which)
-    path = checkpoints / str(step)
-    described = checkpoint_meta.trusted(path)
-    if isinstance(described, str):  # since it was looked at
-        raise CheckpointError(f"checkpoint {path} is damaged: {described}.")
-    meta, config = described
+    step, (meta, config), warnings = _readable(checkpoints, found, which)
     model = world_model.WorldModel(config.model)
-    return run_lib.Run(model, _restore_variables(path, model), config, step, folder, meta["provenance"],
-                       tuple(warnings))
+    variables = _restore_variables(checkpoints / str(step), model)
+    return run_lib.Run(model, variables, config, step, folder, meta["provenance"], tuple(warnings))
 
 
-def _readable(checkpoints: pathlib.Path, found: list[int], which: int | str) -> tuple[int, list[str]]:
-    """The step that is meant, and what to say of damaged ones that it might have been."""
+def _readable(checkpoints: pathlib.Path, found: list[int], which: int | str) -> tuple[
+        int, tuple[dict[str, Any], config_lib.Config], list[str]]:
+    """The step that is meant, its description and config, and what to say of damaged ones that it might have been."""
     held = ", ".join(map(str, found))
     if which not in ("latest", "best", *found):
         raise CheckpointError(f"{checkpoints} has no step {which}; it has {held}.")
-    scores: dict[int, float | None] = {}
+    readable: dict[int, tuple[dict[str, Any], config_lib.Config]] = {}
     warnings = []
     for step in [which] if isinstance(which, int) else found[::-1]:
         path = checkpoints / str(step)
@@ -306,17 +302,18 @@ def _readable(checkpoints: pathlib.Path, found: list[int], which: int | str) -> 
         if isinstance(described, str):
             warnings.append(f"checkpoint {path} is damaged: {described}; it is passed over.")
         elif which == "best":
-            scores[step] = described[0]["score"]
+            readable[step] = described
         else:
-            return step, warnings
-    if not scores:
+            return step, described, warnings
+    if not readable:
         wanted = f"of step {which}" if isinstance(which, int) else "at all"
         raise CheckpointError(f"no readable checkpoint {wanted} in {checkpoints}, which has {held}: "
                               + " ".join(warnings))
-    scored = {step: score for step, score in scores.items() if score is not None}
+    scored = {step: meta["score"] for step, (meta, _) in readable.items() if meta["score"] is not None}
     if not scored:
         warnings.append(f"no checkpoint in {checkpoints} has a score; the newest is taken for the best.")
-    return max(scored or scores, key=lambda step: scored.get(step, step)), warnings
+    best = max(scored or readable, key=lambda step: scored.get(step, step))
+    return best, readable[best], warnings
 
 
 def _score(metrics: Mapping[str, float]) -> float:

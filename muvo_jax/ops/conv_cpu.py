@@ -22,7 +22,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from muvo_jax.ops import conv_winograd, precision, varying
+from muvo_jax.ops import chunks, conv_winograd, precision
 
 Pairs = tuple[tuple[int, int], ...]
 
@@ -177,7 +177,8 @@ def _correlation(still, shifted, taps: tuple[int, int], dilation: tuple[int, int
     """
     batch, rows, columns, channels = still.shape
     width = math.prod(taps) * shifted.shape[-1]
-    samples, chunk_rows = _chunk(batch, rows, columns * (channels + width) * still.dtype.itemsize)
+    samples, chunk_rows = chunks.size(batch, rows, columns * (channels + width) * still.dtype.itemsize,
+                                      _CHUNK_BYTES)
     row_chunks = -(-rows // chunk_rows)
     missing = ((0, 0), (0, row_chunks * chunk_rows - rows), (0, 0), (0, 0))
     still, shifted = (jnp.pad(a, missing) for a in (still, shifted))
@@ -193,21 +194,9 @@ def _correlation(still, shifted, taps: tuple[int, int], dilation: tuple[int, int
                                        precision=precision.PRODUCTS, preferred_element_type=total.dtype), None
 
     summed = still.dtype if still.dtype.itemsize > 4 else jnp.float32
-    zeros = jnp.tile(varying.zeros(still, shifted, summed), (1, math.prod(taps)))
+    zeros = jnp.tile(chunks.zeros(still, shifted, summed), (1, math.prod(taps)))
     total, _ = lax.scan(add_chunk, zeros, jnp.arange(batch // samples * row_chunks))
     return total.reshape(channels, *taps, -1).transpose(1, 2, 0, 3)
-
-
-def _chunk(batch: int, rows: int, row_bytes: int) -> tuple[int, int]:
-    """Samples and rows per chunk: the samples divide the batch, and either all rows or one sample."""
-    sample_bytes = rows * row_bytes
-    if sample_bytes > _CHUNK_BYTES:
-        chunks = min(rows, -(-sample_bytes // _CHUNK_BYTES))
-        return 1, -(-rows // chunks)
-    samples = min(batch, _CHUNK_BYTES // max(sample_bytes, 1))
-    while batch % samples:
-        samples -= 1
-    return samples, rows
 
 
 @functools.partial(jax.custom_vjp, nondiff_argnums=(2,))

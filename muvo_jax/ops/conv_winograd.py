@@ -18,7 +18,7 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
-from muvo_jax.ops import precision, varying
+from muvo_jax.ops import chunks, precision
 
 Pairs = tuple[tuple[int, int], ...]
 
@@ -73,15 +73,15 @@ def _outputs(x, padding: Pairs) -> list[int]:
 def _convolved(x, kernel_tiles, padding: Pairs, contracted: int):
     """Convolution with the tiles [4, 4, C, O] of a kernel, whose C (contracted = 0) or O (1) x's channels meet."""
     rows, columns = _outputs(x, padding)
-    chunks = _Chunks(x, rows, columns, padding)
+    tiled = _Tiled(x, rows, columns, padding)
 
     def chunk(_, index):
-        tiles = _on_both(_input_axis, chunks.inputs(index))
+        tiles = _on_both(_input_axis, tiled.inputs(index))
         products = lax.dot_general(tiles, kernel_tiles, (((5,), (2 + contracted,)), ((0, 1), (0, 1))),
                                    precision=precision.PRODUCTS)
         return None, _outputs_of(products)
 
-    _, found = lax.scan(chunk, None, jnp.arange(chunks.count))
+    _, found = lax.scan(chunk, None, jnp.arange(tiled.count))
     found = found.reshape(x.shape[0], -1, *found.shape[-2:])
     return found[:, :rows, :columns]
 
@@ -89,26 +89,26 @@ def _convolved(x, kernel_tiles, padding: Pairs, contracted: int):
 def _kernel_gradient(x, gradient, padding: Pairs):
     """sum over n, i of x[n, i + tap]^T gradient[n, i] [3, 3, C, O]."""
     rows, columns = gradient.shape[1:3]
-    chunks = _Chunks(x, rows, columns, padding)
-    gradient = jnp.pad(gradient, ((0, 0), (0, chunks.rows_in_all - rows), (0, chunks.columns - columns), (0, 0)))
+    tiled = _Tiled(x, rows, columns, padding)
+    gradient = jnp.pad(gradient, ((0, 0), (0, tiled.rows_in_all - rows), (0, tiled.columns - columns), (0, 0)))
 
     def add_chunk(total, index):
-        tiles = _on_both(_input_axis, chunks.inputs(index))
-        gradients = _on_both(_gradient_axis, chunks.of(gradient, index, 0))
+        tiles = _on_both(_input_axis, tiled.inputs(index))
+        gradients = _on_both(_gradient_axis, tiled.of(gradient, index, 0))
         return total + lax.dot_general(tiles, gradients, (((2, 3, 4), (2, 3, 4)), ((0, 1), (0, 1))),
                                        precision=precision.PRODUCTS), None
 
-    zeros = jnp.broadcast_to(varying.zeros(x, gradient, x.dtype), (4, 4, x.shape[-1], gradient.shape[-1]))
-    total, _ = lax.scan(add_chunk, zeros, jnp.arange(chunks.count))
+    zeros = jnp.broadcast_to(chunks.zeros(x, gradient, x.dtype), (4, 4, x.shape[-1], gradient.shape[-1]))
+    total, _ = lax.scan(add_chunk, zeros, jnp.arange(tiled.count))
     return _taps(_taps(total).swapaxes(0, 1))
 
 
-class _Chunks:
+class _Tiled:
     """x, padded so that its outputs are whole chunks of tiles: some whole samples, or some rows of tiles of one."""
 
     def __init__(self, x, rows: int, columns: int, padding: Pairs):
         tile_rows, tile_columns = -(-rows // 2), -(-columns // 2)
-        self.samples, self.tile_rows = _chunk(x.shape[0], tile_rows, tile_columns)
+        self.samples, self.tile_rows = chunks.size(x.shape[0], tile_rows, tile_columns, _CHUNK_TILES)
         self.row_chunks = -(-tile_rows // self.tile_rows)
         self.count = x.shape[0] // self.samples * self.row_chunks
         self.rows_in_all, self.columns = 2 * self.tile_rows * self.row_chunks, 2 * tile_columns
@@ -124,17 +124,6 @@ class _Chunks:
     def inputs(self, index):
         """What a chunk of outputs reads."""
         return self.of(self.x, index, 2)
-
-
-def _chunk(batch: int, tile_rows: int, tile_columns: int) -> tuple[int, int]:
-    """Samples and rows of tiles per chunk: the samples divide the batch, and either all rows or one sample."""
-    tiles = tile_rows * tile_columns
-    if tiles > _CHUNK_TILES:
-        return 1, -(-tile_rows // round(tiles / _CHUNK_TILES))
-    samples = min(batch, _CHUNK_TILES // tiles)
-    while batch % samples:
-        samples -= 1
-    return samples, tile_rows
 
 
 def _on_both(along: Callable[[jax.Array, int], Sequence[jax.Array]], image):

@@ -1,9 +1,20 @@
-"""Arrays inside jax.shard_map that vary from device to device where others do."""
+"""Products over all pixels of images, some samples or rows at a time: how many, and what their sum starts from."""
 
 from __future__ import annotations
 
 import jax.numpy as jnp
 from jax import lax
+
+
+def size(batch: int, rows: int, row: int, most: int) -> tuple[int, int]:
+    """Samples and rows of a chunk of about `most`, a row being `row`: the samples divide the batch, and either all rows
+    or one sample; at least one row."""
+    if rows * row > most:
+        return 1, -(-rows // min(rows, -(-rows * row // most)))
+    samples = min(batch, most // max(rows * row, 1))
+    while batch % samples:
+        samples -= 1
+    return samples, rows
 
 
 def zeros(left, right, dtype):

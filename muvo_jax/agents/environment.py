@@ -27,7 +27,6 @@ from muvo_jax.model.world_model import WorldModel
 from muvo_jax.ops import motion as motion_ops
 from muvo_jax.types import Array, LatentState, Variables
 
-OBSERVATIONS = fits.OBSERVATIONS
 ACTION_CHANNELS = checks.ACTION_CHANNELS
 RewardFunction = Callable[[rewards.Moment], tuple[Array, Array, dict[str, Array]]]
 

@@ -25,7 +25,7 @@ from flax import traverse_util
 
 from muvo_jax import run as run_lib
 from muvo_jax import safetensors_file
-from muvo_jax.agents import actor_critic
+from muvo_jax.agents import actor_critic, fits
 from muvo_jax.agents import environment as environment_lib
 from muvo_jax.config import parsing
 from muvo_jax.types import Variables
@@ -117,9 +117,9 @@ def load(folder: str | os.PathLike, run: run_lib.Run) -> StoredPolicy:
     config = parsing.parse(actor_critic.ActorCriticConfig, described.get("actor_critic"), f"{path}: actor_critic")
     actor = traverse_util.unflatten_dict(
         {name: jnp.asarray(value) for name, value in safetensors_file.load(folder / WEIGHTS).items()}, sep="/")
-    if observation not in environment_lib.OBSERVATIONS:
+    if observation not in fits.OBSERVATIONS:
         raise ValueError(f"{path}: the agent observes {observation!r}, this version knows "
-                         f"{', '.join(environment_lib.OBSERVATIONS)}.")
+                         f"{', '.join(fits.OBSERVATIONS)}.")
     stored = StoredPolicy(config, actor, training, observation)
     _check_network(stored, run, folder)
     return stored
